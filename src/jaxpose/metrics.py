@@ -1,0 +1,223 @@
+"""How far an estimate is from the truth: alignment, trajectory errors, image error. numpy, float64.
+
+Poses are camera-to-world (or body-to-world) matrices, matched row by row. Rows with a NaN or an infinity in
+either input carry no information: they are left out and counted, never an error by themselves.
+"""
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Shaped
+
+from jaxpose.errors import DataError
+
+Alignment = Literal["none", "se3", "sim3"]
+
+
+class Similarity(NamedTuple):
+    """The map `scale * rotation @ point + translation`."""
+
+    scale: float
+    rotation: Float[np.ndarray, "3 3"]
+    translation: Float[np.ndarray, "3"]
+
+
+class Statistics(NamedTuple):
+    """Summary of per-frame errors, in their unit; `std` is that of the population (divided by n)."""
+
+    rmse: float
+    mean: float
+    median: float
+    std: float
+    min: float
+    max: float
+
+
+class Ate(NamedTuple):
+    """Absolute trajectory error [m]: distances between camera centres after alignment."""
+
+    rmse: float
+    mean: float
+    median: float
+    std: float
+    min: float
+    max: float
+    errors: Float[np.ndarray, " n"]  # one per row of the input, NaN where left out
+    alignment: Similarity  # estimate -> reference
+    frames: int  # rows used
+    skipped: int  # rows left out for a NaN or an infinity
+
+
+class Rpe(NamedTuple):
+    """Relative pose error over a fixed number of frames: drift of translation [m] and of rotation [deg]."""
+
+    translation_m: Statistics
+    rotation_deg: Statistics
+    translation_errors_m: Float[np.ndarray, " p"]  # one per pair (i, i + delta), NaN where left out
+    rotation_errors_deg: Float[np.ndarray, " p"]
+    pairs: int
+    skipped: int
+
+
+def nearest_rotation(matrix: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n 3 3"]:
+    """The rotations closest (least squares) to finite 3x3 matrices; never a reflection."""
+    left, _, right = np.linalg.svd(matrix)
+    left[..., :, 2] *= np.sign(np.linalg.det(left @ right))[..., None]
+    return left @ right
+
+
+def umeyama(
+    estimate: Float[np.ndarray, "n 3"], reference: Float[np.ndarray, "n 3"], with_scale: bool
+) -> Similarity:
+    """The rigid map (similarity if `with_scale`) of estimated points closest to reference points.
+
+    Least squares after Umeyama, PAMI 1991; all rows must be finite (DataError otherwise). It is a minimum
+    for any input, but not the only one for points on a line, about which the rotation stays free, nor for
+    points all in one place, where the rotation is then the identity and the scale 1.
+    """
+    if len(estimate) == 0 or not (np.isfinite(estimate).all() and np.isfinite(reference).all()):
+        raise DataError(f"alignment: expected finite points, at least one, got {len(estimate)} rows")
+    center_estimate, estimate = _centered(estimate)
+    center_reference, reference = _centered(reference)
+    covariance = reference.T @ estimate
+    rotation = nearest_rotation(covariance)
+    size = np.sum(estimate**2)
+    scale = float(np.sum(rotation * covariance) / size) if with_scale and size > 0 else 1.0
+    return Similarity(scale, rotation, center_reference - scale * rotation @ center_estimate)
+
+
+def align(alignment: Similarity, T_ref_cam: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 4 4"]:
+    """Move poses by a similarity; centres are scaled, rotations stay rotations."""
+    aligned = np.array(T_ref_cam, np.float64)
+    aligned[:, :3, :3] = alignment.rotation @ T_ref_cam[:, :3, :3]
+    aligned[:, :3, 3] = alignment.scale * T_ref_cam[:, :3, 3] @ alignment.rotation.T + alignment.translation
+    return aligned
+
+
+def align_trajectory(
+    estimate: Float[np.ndarray, "n 4 4"], reference: Float[np.ndarray, "n 4 4"], alignment: Alignment
+) -> Similarity:
+    """The map of estimated camera centres onto the reference: nothing, rigid or with scale, over usable rows.
+
+    DataError where an alignment is asked of fewer than three usable poses: it would fit them perfectly and
+    mean nothing. Centres on a line are aligned; see `umeyama` for what stays free.
+    """
+    used = _usable(estimate, reference)
+    least = 1 if alignment == "none" else 3
+    if used.sum() < least:
+        raise DataError(
+            f"alignment {alignment}: expected at least {least} pairs of finite poses, got {used.sum()}"
+        )
+    if alignment == "none":
+        return Similarity(1.0, np.eye(3), np.zeros(3))
+    return umeyama(estimate[used, :3, 3], reference[used, :3, 3], with_scale=alignment == "sim3")
+
+
+def ate(
+    estimate: Float[np.ndarray, "n 4 4"], reference: Float[np.ndarray, "n 4 4"], alignment: Alignment = "se3"
+) -> Ate:
+    """Absolute trajectory error [m] of matched poses after the named alignment of camera centres.
+
+    DataError on too few usable rows, see `align_trajectory`.
+    """
+    similarity = align_trajectory(estimate, reference, alignment)
+    used = _usable(estimate, reference)
+    errors = np.full(len(used), np.nan)
+    aligned = align(similarity, estimate[used])
+    errors[used] = np.linalg.norm(aligned[:, :3, 3] - reference[used, :3, 3], axis=-1)
+    frames = int(used.sum())
+    return Ate(*statistics(errors), errors, similarity, frames, len(used) - frames)
+
+
+def rpe(
+    estimate: Float[np.ndarray, "n 4 4"],
+    reference: Float[np.ndarray, "n 4 4"],
+    delta: int = 1,
+    alignment: Alignment = "se3",
+) -> Rpe:
+    """Relative pose error over every pair of frames (i, i + delta), overlapping pairs included.
+
+    Motions relative to a frame are free of any rigid alignment, so "none" and "se3" agree; "sim3" scales the
+    estimate first. ValueError for `delta` below 1, DataError without a usable pair.
+    """
+    if delta < 1:
+        raise ValueError(f"rpe: expected delta of at least 1 frame, got {delta}")
+    scale = align_trajectory(estimate, reference, "sim3").scale if alignment == "sim3" else 1.0
+    used = _usable(estimate[:-delta], reference[:-delta]) & _usable(estimate[delta:], reference[delta:])
+    if not used.any():
+        raise DataError(
+            f"relative pose error: expected two finite poses {delta} frames apart, got {len(estimate)} poses"
+        )
+    moved, truth = (_relative(T[:-delta][used], T[delta:][used]) for T in (estimate, reference))
+    moved[:, :3, 3] *= scale
+    translation, rotation = np.full((2, len(used)), np.nan)
+    # The error's translation is this difference turned into the reference's last frame: of the same length.
+    translation[used] = np.linalg.norm(moved[:, :3, 3] - truth[:, :3, 3], axis=-1)
+    rotation[used] = rotation_angle_deg(moved[:, :3, :3], truth[:, :3, :3])
+    pairs = int(used.sum())
+    return Rpe(statistics(translation), statistics(rotation), translation, rotation, pairs, len(used) - pairs)
+
+
+def rotation_angle_deg(
+    R_world_a: Float[np.ndarray, "*n 3 3"], R_world_b: Float[np.ndarray, "*n 3 3"]
+) -> Float[np.ndarray, "*n"]:
+    """Angle between orientations [deg], 0 to 180, accurate at both ends; NaN where an input is.
+
+    Compare trajectories after `align`: it takes the rotation between their worlds out.
+    """
+    R_a_b = np.asarray(R_world_a, np.float64).swapaxes(-1, -2) @ R_world_b
+    skew = R_a_b - R_a_b.swapaxes(-1, -2)
+    sine = np.sqrt(skew[..., 2, 1] ** 2 + skew[..., 0, 2] ** 2 + skew[..., 1, 0] ** 2)
+    return np.asarray(np.degrees(np.arctan2(sine, np.trace(R_a_b, axis1=-2, axis2=-1) - 1)))
+
+
+def statistics(errors: Float[np.ndarray, " n"]) -> Statistics:
+    """Summary of errors, NaN left out; all NaN if nothing is left."""
+    errors = errors[~np.isnan(errors)]
+    if not len(errors):
+        return Statistics(*[float("nan")] * 6)
+    numbers = (
+        np.sqrt(np.mean(errors**2)),
+        errors.mean(),
+        np.median(errors),
+        errors.std(),
+        errors.min(),
+        errors.max(),
+    )
+    return Statistics(*map(float, numbers))
+
+
+def psnr(image: Shaped[np.ndarray, "*n"], reference: Shaped[np.ndarray, "*n"], peak: float = 1.0) -> float:
+    """Peak signal-to-noise ratio [dB] of images with values from 0 to `peak`; inf if they are equal."""
+    difference = np.asarray(image, np.float64) - np.asarray(reference, np.float64)
+    error = float(np.mean(difference**2))
+    return float("inf") if error == 0 else float(10 * np.log10(peak**2 / error))
+
+
+def _centered(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "n 3"]]:
+    """Mean and deviations; deviations that are only the mean's rounding (a camera at rest) are zero."""
+    points = np.asarray(points, np.float64)
+    center = points.mean(0)
+    deviations = points - center
+    at_rest = np.abs(deviations).max() <= 1e-13 * np.abs(center).max()
+    return center, np.zeros_like(points) if at_rest else deviations
+
+
+def _usable(
+    estimate: Float[np.ndarray, "n 4 4"], reference: Float[np.ndarray, "n 4 4"]
+) -> Bool[np.ndarray, " n"]:
+    """Rows that are finite in both; DataError for different numbers of rows, which would broadcast."""
+    if estimate.shape != reference.shape:
+        raise DataError(f"trajectories: expected matched poses, got {estimate.shape} and {reference.shape}")
+    return np.asarray(np.isfinite(np.concatenate([estimate, reference], -1)).all((1, 2)))
+
+
+def _relative(
+    T_world_a: Float[np.ndarray, "n 4 4"], T_world_b: Float[np.ndarray, "n 4 4"]
+) -> Float[np.ndarray, "n 4 4"]:
+    """T_a_b of rigid poses."""
+    R_a_world = np.asarray(T_world_a, np.float64)[:, :3, :3].swapaxes(-1, -2)
+    T_a_b = np.tile(np.eye(4), (len(T_world_a), 1, 1))
+    T_a_b[:, :3, :3] = R_a_world @ T_world_b[:, :3, :3]
+    T_a_b[:, :3, 3] = np.einsum("nij,nj->ni", R_a_world, T_world_b[:, :3, 3] - T_world_a[:, :3, 3])
+    return T_a_b
