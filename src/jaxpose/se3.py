@@ -13,7 +13,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-_TERMS = 9  # leaves less than 1e-15 of each series below, second derivatives included
+_TERMS = 9  # leaves less than 1e-15 of each series below 1, second derivatives included
+# sin(x)/x, (1 - cos x)/x^2 and (x - sin x)/x^3 in x^2
+_SINE = tuple([(-1) ** k / math.factorial(2 * k + first) for k in range(_TERMS)] for first in (1, 2, 3))
+# arcsin(s)/s in s^2, for s below 0.2
+_ARCSINE = [math.comb(2 * k, k) / 4**k / (2 * k + 1) for k in range(13)]
+# (1 - x/2 cot(x/2))/x^2 in x^2, from the Bernoulli numbers |B_2k|
+_BERNOULLI = (1 / 6, 1 / 30, 1 / 42, 1 / 30, 5 / 66, 691 / 2730, 7 / 6, 3617 / 510, 43867 / 798)
+_COTANGENT = [b / math.factorial(2 * k) for k, b in enumerate(_BERNOULLI, start=1)]
 
 
 def hat(omega: Float[Array, "*n 3"]) -> Float[Array, "*n 3 3"]:
@@ -172,15 +179,8 @@ def _exp_coefficients(
     sine = jnp.sin(angle)
     far = (sine / angle, (1 - jnp.cos(angle)) / angle**2, (angle - sine) / angle**3)
     x = jnp.where(near, square, 0)
-    a, b, c = (jnp.where(near, _polynomial(near_x, x), f) for near_x, f in zip(_SINE, far, strict=True))
+    a, b, c = (jnp.where(near, _polynomial(series, x), f) for series, f in zip(_SINE, far, strict=True))
     return a, b, c
-
-
-_SINE = tuple([(-1) ** k / math.factorial(2 * k + first) for k in range(_TERMS)] for first in (1, 2, 3))
-_ARCSINE = [math.comb(2 * k, k) / 4**k / (2 * k + 1) for k in range(13)]  # arcsin(s)/s in s^2, below 0.2
-# (1 - x/2 cot(x/2))/x^2 in x^2, from the Bernoulli numbers |B_2k|
-_BERNOULLI = (1 / 6, 1 / 30, 1 / 42, 1 / 30, 5 / 66, 691 / 2730, 7 / 6, 3617 / 510, 43867 / 798)
-_COTANGENT = [b / math.factorial(2 * k) for k, b in enumerate(_BERNOULLI, start=1)]
 
 
 def _polynomial(coefficients: list[float], x: Float[Array, "*n"]) -> Float[Array, "*n"]:
