@@ -1,0 +1,260 @@
+"""Files of a run: trajectories (TUM, KITTI, EuRoC), run folders, JSON. Files appear whole or not at all."""
+
+import dataclasses
+import json
+import math
+import os
+import platform
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import datetime
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
+
+import jaxpose
+from jaxpose.errors import DataError
+from jaxpose.metrics import nearest_rotation
+
+_TUM_COLUMNS = "8 numbers (t tx ty tz qx qy qz qw)"
+_KITTI_COLUMNS = "12 numbers (the rows of a 3x4 pose)"
+_EUROC_COLUMNS = "17 numbers (stamp, position, quaternion wxyz, velocity, biases) or the first 8 of them"
+_MOST_OFF_ROTATION = 1e-2  # entries of a rotation matrix; more is not rounding
+
+
+class Trajectory(NamedTuple):
+    """Stamped poses: seconds, increasing, and `T_world_cam` (or of the body), both float64."""
+
+    t: Float[np.ndarray, " n"]
+    T: Float[np.ndarray, "n 4 4"]
+
+
+# --- trajectories ---------------------------------------------------------------------------------------
+
+
+def read_tum(path: Path | str) -> Trajectory:
+    """Read a TUM trajectory: lines of `t tx ty tz qx qy qz qw`, `#` comments; quaternions are normalised.
+
+    DataError naming file and line for a wrong number of columns, text or NaN where a number belongs, a zero
+    quaternion, or stamps that repeat or go backwards; FileNotFoundError as usual.
+    """
+    lines, values = _read_numbers(Path(path), _TUM_COLUMNS, counts=(8,))
+    return _stamped(Path(path), lines, values[:, 0], values[:, 1:4], values[:, 4:])
+
+
+def write_tum(path: Path | str, trajectory: Trajectory) -> None:
+    """Write a TUM trajectory that reads back to the last bit (rotations to rounding).
+
+    Poses with NaN, such as truth that is missing, are left out: the format has no word for them.
+    """
+    finite = np.isfinite(trajectory.T).all((1, 2))
+    T = np.asarray(trajectory.T[finite], np.float64)
+    quaternion_xyzw = Rotation.from_matrix(T[:, :3, :3]).as_quat(canonical=True)
+    rows = np.column_stack([trajectory.t[finite], T[:, :3, 3], quaternion_xyzw])
+    write_text(path, "# timestamp tx ty tz qx qy qz qw\n" + _lines(rows))
+
+
+def read_kitti(path: Path | str, *, rate_hz: float = 10.0) -> Trajectory:
+    """Read a KITTI trajectory: per line the 12 numbers of a 3x4 pose, row by row.
+
+    The format has no stamps: frame i is at i / rate_hz seconds. Rotations are made orthonormal; DataError as
+    `read_tum`, and for a matrix that is more than rounding off a rotation.
+    """
+    path = Path(path)
+    lines, values = _read_numbers(path, _KITTI_COLUMNS, counts=(12,))
+    T = np.tile(np.eye(4), (len(values), 1, 1))
+    T[:, :3] = values.reshape(-1, 3, 4)
+    rotation = nearest_rotation(T[:, :3, :3])
+    off = np.abs(T[:, :3, :3] - rotation).max(axis=(1, 2))
+    if off.max() > _MOST_OFF_ROTATION:
+        raise DataError(
+            f"{path}:{lines[off.argmax()]}: expected a rotation, got a matrix {off.max():.2g} off one"
+        )
+    T[:, :3, :3] = rotation
+    return Trajectory(np.arange(len(T)) / rate_hz, T)
+
+
+def write_kitti(path: Path | str, T_world_cam: Float[np.ndarray, "n 4 4"]) -> None:
+    """Write poses as KITTI does; DataError for NaN, which cannot be left out as lines count the frames."""
+    finite = np.isfinite(T_world_cam).all((1, 2))
+    if not finite.all():
+        raise DataError(f"{path}: expected finite poses, got NaN or infinity in frame {finite.argmin()}")
+    write_text(path, _lines(T_world_cam[:, :3].reshape(-1, 12)))
+
+
+def read_euroc(path: Path | str) -> Trajectory:
+    """Read EuRoC or TUM-VI truth (csv: stamp [ns], position, quaternion wxyz, ...): T_world_body.
+
+    Stamps become float64 seconds since 1970, which resolves 0.24 microseconds. DataError as `read_tum`.
+    """
+    lines, values = _read_numbers(Path(path), _EUROC_COLUMNS, counts=(17, 8), separator=",")
+    return _stamped(Path(path), lines, values[:, 0] / 1e9, values[:, 1:4], values[:, [5, 6, 7, 4]])
+
+
+def associate(
+    t_a: Float[np.ndarray, " a"], t_b: Float[np.ndarray, " b"], max_difference: float = 0.01
+) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
+    """Indices into both lists of increasing stamps that lie at most `max_difference` seconds apart.
+
+    Every stamp of the shorter list (of `t_b` if equally long) takes the nearest of the longer, the earlier of
+    two equally near; one stamp of the longer may serve two. DataError if none matches.
+    """
+    if len(t_b) <= len(t_a):
+        near_a, near_b = _nearest(t_b, t_a), np.arange(len(t_b))
+    else:
+        near_a, near_b = np.arange(len(t_a)), _nearest(t_a, t_b)
+    close = np.abs(t_a[near_a] - t_b[near_b]) <= max_difference
+    if not close.any():
+        spans = [f"{t[0]:.3f} to {t[-1]:.3f} s" if len(t) else "no stamps" for t in (t_a, t_b)]
+        raise DataError(f"trajectories: expected stamps within {max_difference} s, got {' and '.join(spans)}")
+    return near_a[close], near_b[close]
+
+
+def _nearest(t: Float[np.ndarray, " n"], among: Float[np.ndarray, " m"]) -> Int[np.ndarray, " n"]:
+    """Index of the nearest of increasing stamps, the earlier of two equally near."""
+    after = np.minimum(np.searchsorted(among, t, side="right"), len(among) - 1)
+    before = np.maximum(after - 1, 0)
+    return np.where(np.abs(among[after] - t) < np.abs(t - among[before]), after, before)
+
+
+def _stamped(
+    path: Path,
+    lines: list[int],
+    t: Float[np.ndarray, " n"],
+    translation: Float[np.ndarray, "n 3"],
+    quaternion_xyzw: Float[np.ndarray, "n 4"],
+) -> Trajectory:
+    """A trajectory from columns, their values checked."""
+    for row in np.flatnonzero(np.linalg.norm(quaternion_xyzw, axis=1) < 1e-6):
+        raise DataError(f"{path}:{lines[row]}: expected a unit quaternion, got zero")
+    for row in np.flatnonzero(np.diff(t) <= 0) + 1:
+        raise DataError(f"{path}:{lines[row]}: expected a stamp after {t[row - 1]!s} s, got {t[row]!s} s")
+    T = np.tile(np.eye(4), (len(t), 1, 1))
+    T[:, :3, :3] = Rotation.from_quat(quaternion_xyzw).as_matrix()
+    T[:, :3, 3] = translation
+    return Trajectory(t, T)
+
+
+def _read_numbers(
+    path: Path, columns: str, counts: tuple[int, ...], separator: str | None = None
+) -> tuple[list[int], Float[np.ndarray, "n c"]]:
+    """Line numbers and the first min(counts) columns of a table; each line has one of `counts` columns."""
+    lines, rows = [], []
+    for number, line in enumerate(
+        path.read_text(encoding="utf-8-sig", errors="replace").splitlines(), start=1
+    ):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        fields = line.split(separator)
+        if len(fields) not in counts:
+            raise DataError(f"{path}:{number}: expected {columns}, got {len(fields)}")
+        try:
+            row = [float(field) for field in fields][: min(counts)]
+        except ValueError:
+            raise DataError(f"{path}:{number}: expected {columns}, got {line[:60]!r}") from None
+        if not all(map(math.isfinite, row)):
+            raise DataError(f"{path}:{number}: expected finite numbers, got {line[:60]!r}")
+        lines.append(number)
+        rows.append(row)
+    if not rows:
+        raise DataError(f"{path}: expected lines of {columns}, got none")
+    return lines, np.array(rows)
+
+
+def _lines(rows: Float[np.ndarray, "n c"]) -> str:
+    """Rows as text, every number in the fewest digits that give it back exactly."""
+    return "".join(" ".join(map(repr, row)) + "\n" for row in np.asarray(rows, np.float64).tolist())
+
+
+# --- writing --------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def atomic(path: Path | str) -> Iterator[Path]:
+    """Where to write a file that is to appear at `path` only when the block ends, and not if it fails.
+
+    The temporary path is in the same folder and has the same suffix (by which some writers choose a format).
+    """
+    path = Path(path)
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_text(path: Path | str, text: str) -> None:
+    """Write a text file atomically."""
+    with atomic(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def write_json(path: Path | str, value: Any) -> None:
+    """Write JSON atomically.
+
+    Beside what JSON knows, it takes numpy and JAX numbers and arrays, paths, dataclasses and NamedTuples (as
+    objects); NaN and infinities, which JSON lacks, become null. TypeError for anything else.
+    """
+    write_text(path, json.dumps(_plain(value), indent=2, allow_nan=False) + "\n")
+
+
+def _plain(value: Any) -> Any:
+    """The value in JSON's own types."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        value = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+    elif isinstance(value, tuple) and hasattr(value, "_asdict"):
+        value = value._asdict()  # pyright: ignore[reportAttributeAccessIssue]
+    elif isinstance(value, np.ndarray | np.generic | jax.Array):
+        value = np.asarray(value).tolist()
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return str(value) if isinstance(value, Path) else value
+
+
+# --- the run --------------------------------------------------------------------------------------------
+
+
+def run_folder(experiment: str, *, name: str | None = None, out: Path | str | None = None) -> Path:
+    """Make and return the folder of a run: `out` if given, else `outputs/<experiment>/<name or time stamp>`.
+
+    A folder that was named may exist already, to be written over or resumed.
+    """
+    stamp = f"{datetime.now():%Y-%m-%d_%H-%M-%S.%f}"
+    folder = Path(out) if out is not None else Path("outputs") / experiment / (name or stamp)
+    folder.mkdir(parents=True, exist_ok=out is not None or name is not None)
+    return folder
+
+
+def peak_rss_bytes() -> int:
+    """The most memory this process has held."""
+    status = Path("/proc/self/status")
+    for line in status.read_text().splitlines() if status.exists() else ():
+        if line.startswith("VmHWM:"):
+            return int(line.split()[1]) * 1024
+    import resource  # not on Windows
+
+    # Also counts the parent up to the fork, hence the second choice; macOS gives bytes, others kilobytes.
+    unit = 1 if platform.system() == "Darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
+
+
+def versions() -> dict[str, str]:
+    """What a result depends on besides its configuration: software and device."""
+    return {
+        "python": platform.python_version(),
+        "jaxpose": jaxpose.__version__,
+        "jax": jax.__version__,
+        "numpy": np.__version__,
+        "platform": platform.platform(),
+        "backend": jax.default_backend(),
+        "device": jax.devices()[0].device_kind,
+    }
