@@ -14,8 +14,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 _TERMS = 9  # leaves less than 1e-15 of each series below 1, second derivatives included
-# sin(x)/x, (1 - cos x)/x^2 and (x - sin x)/x^3 in x^2
-_SINE = tuple([(-1) ** k / math.factorial(2 * k + first) for k in range(_TERMS)] for first in (1, 2, 3))
+# (1 - cos x)/x^2 and (x - sin x)/x^3 in x^2
+_COSINE = [(-1) ** k / math.factorial(2 * k + 2) for k in range(_TERMS)]
+_SINE = [(-1) ** k / math.factorial(2 * k + 3) for k in range(_TERMS)]
 # arcsin(s)/s in s^2, for s below 0.2
 _ARCSINE = [math.comb(2 * k, k) / 4**k / (2 * k + 1) for k in range(13)]
 # (1 - x/2 cot(x/2))/x^2 in x^2, from the Bernoulli numbers |B_2k|
@@ -175,12 +176,12 @@ def _exp_coefficients(
 ) -> tuple[Float[Array, "*n 1"], Float[Array, "*n 1"], Float[Array, "*n 1"]]:
     """sin(x)/x, (1 - cos x)/x^2 and (x - sin x)/x^3 from x^2, smooth at 0."""
     near = square < 1
-    angle = jnp.sqrt(jnp.where(near, 1, square))
-    sine = jnp.sin(angle)
-    far = (sine / angle, (1 - jnp.cos(angle)) / angle**2, (angle - sine) / angle**3)
     x = jnp.where(near, square, 0)
-    a, b, c = (jnp.where(near, _polynomial(series, x), f) for series, f in zip(_SINE, far, strict=True))
-    return a, b, c
+    far = jnp.where(near, 1, square)
+    angle = jnp.sqrt(far)
+    b = jnp.where(near, _polynomial(_COSINE, x), (1 - jnp.cos(angle)) / far)
+    c = jnp.where(near, _polynomial(_SINE, x), (1 - jnp.sin(angle) / angle) / far)
+    return 1 - c * square, b, c
 
 
 def _polynomial(coefficients: list[float], x: Float[Array, "*n"]) -> Float[Array, "*n"]:
