@@ -123,13 +123,13 @@ def bake(pieces: list[Piece], shapes: Shapes, rng: np.random.Generator) -> Atlas
 
     charts, used = [], 0
     for (piece, face), (width, height), (columns, rows) in zip(faces, size, lattice, strict=True):
-        if width * height == 0:
+        lit = light[used : used + rows * columns].reshape(rows, columns, 3)
+        used += rows * columns
+        if not lit.any():  # no such face, or nothing can see it
             charts.append([np.zeros((1, 1, 3), np.float32)] * LEVELS)
             continue
         painter = piece.painters[face % len(piece.painters)]
         colour = painter(rng, (np.arange(width) + 0.5) * TEXEL, (np.arange(height) + 0.5) * TEXEL)
-        lit = light[used : used + rows * columns].reshape(rows, columns, 3)
-        used += rows * columns
         row, column = ((np.arange(n) + 0.5) * m / n - 0.5 for n, m in ((height, rows), (width, columns)))
         charts.append(_levels(colour * paint.enlarge(lit, row, column)))
     return _pack(charts)
