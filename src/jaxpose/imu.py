@@ -5,7 +5,6 @@ world, or the body's own frame at the last image. For a field of camera poses co
 right. Simulation is in `imu_simulation.py`.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import chex
@@ -16,9 +15,8 @@ from jaxtyping import Array, Bool, Float
 
 from jaxpose import se3
 from jaxpose.errors import DataError
-from jaxpose.motion import motion, velocity
+from jaxpose.motion import PoseFn, motion, velocity
 
-PoseFn = Callable[[Float[Array, ""]], Float[Array, "4 4"]]
 AnyArray = Array | np.ndarray  # recordings are numpy float64, training is jax
 
 GRAVITY_WORLD = (0.0, 0.0, -9.80665)

@@ -11,8 +11,8 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline, Slerp
 
 from jaxpose.errors import DataError
-from jaxpose.imu import GRAVITY_WORLD, QUIET, Gravity, Imu, ImuNoise, PoseFn
-from jaxpose.motion import motion
+from jaxpose.imu import GRAVITY_WORLD, QUIET, Gravity, Imu, ImuNoise
+from jaxpose.motion import PoseFn, motion
 
 
 def simulate(
