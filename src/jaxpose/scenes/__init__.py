@@ -1,0 +1,8 @@
+"""Scenes: point to geometry and colour, one family a file."""
+
+from jaxpose.scenes.base import SceneField as SceneField
+from jaxpose.scenes.grid import GridConfig as GridConfig
+from jaxpose.scenes.grid import box as box
+from jaxpose.scenes.grid import grid as grid
+from jaxpose.scenes.grid import grow as grow
+from jaxpose.scenes.grid import merge as merge

@@ -1,0 +1,41 @@
+"""Keyframes: which frames are kept, and which of them a mapping step looks at again."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxpose.camera import Camera
+from jaxpose.slam.observe import Image
+
+
+class Keyframe(NamedTuple):
+    """A frame that is kept: its image on the device and where it was taken from."""
+
+    index: int
+    image: Image
+    T_world_cam: np.ndarray  # (4, 4)
+
+
+def overlap(points_world: np.ndarray, T_world_cam: np.ndarray, camera: Camera, *, margin: int = 20) -> np.ndarray:
+    """Share of world points (n, 3) that each of the cameras (k, 4, 4) has in its image, (k,) (NICE-SLAM's test).
+
+    The lens' distortion is left out, which is exact enough for a share.
+    """
+    T_cam_world = np.linalg.inv(T_world_cam)
+    points = np.einsum("kij,nj->kni", T_cam_world[:, :3, :3], points_world) + T_cam_world[:, None, :3, 3]
+    z = np.maximum(points[..., 2], 1e-6)
+    u = points[..., 0] / z * camera.fx + camera.cx
+    v = points[..., 1] / z * camera.fy + camera.cy
+    inside = (u >= margin) & (u < camera.width - margin) & (v >= margin) & (v < camera.height - margin)
+    return np.mean(inside & (points[..., 2] > 0), axis=1)
+
+
+def choose(shares: np.ndarray, count: int, generator: np.random.Generator) -> list[int]:
+    """`count` keyframes for a mapping window: the last one, and a random choice of those that overlap.
+
+    Repeats keyframes when there are fewer.
+    """
+    last = len(shares) - 1
+    others = np.flatnonzero(shares[:-1] > 0)
+    chosen = [last, *generator.permutation(others)[: count - 1]]
+    return [int(chosen[i % len(chosen)]) for i in range(count)]

@@ -1,0 +1,100 @@
+"""Where the body will be at the next frame: at constant speed, or by its inertial readings."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxpose import imu as inertial
+from jaxpose import se3
+from jaxpose.imu import Imu
+
+AHEAD = 8  # stamps of a predicted motion
+BEHIND = 3  # frames before the last one that the field keeps to
+
+
+class Interval(NamedTuple):
+    """What is known of the motion since the last frame (`ref`) before this frame's image is looked at."""
+
+    t: Float[Array, ""]  # [s] of this frame, since the last
+    stamps: Float[Array, " k"]  # [s] of the predicted motion, and of the frames before the last (negative)
+    T_ref_body: Float[Array, "k 4 4"]
+    readings: "Readings"
+
+
+class Readings(NamedTuple):
+    """Inertial readings since the last frame, padded: times [s], what was read, and what follows from it."""
+
+    imu: Imu
+    mask: Bool[Array, " s"]
+    R_ref_body: Float[Array, "s 3 3"]  # the gyroscope integrated
+    acceleration_body: Float[Array, "s 3"]  # free of gravity [m/s^2]
+    velocity_ref: Float[Array, "s 3"]  # acceleration integrated once, from rest [m/s]
+    position_ref: Float[Array, "s 3"]  # and twice [m]
+
+
+@jax.jit
+def integrate(
+    imu: Imu, mask: Bool[Array, " s"], R_world_ref: Float[Array, "3 3"], gravity_world: Float[Array, "3"]
+) -> Readings:
+    """Rotation, velocity and position that an interval's readings add up to, in the frame of its start."""
+    R_ref_body = inertial.integrate_gyro(jnp.eye(3), imu.t, imu.omega_body, mask)
+    R_world_body = jnp.matmul(R_world_ref[None], R_ref_body, precision="highest")
+    acceleration_body = inertial.remove_gravity(imu, R_world_body, gravity_world)
+    acceleration_ref = jnp.einsum("sij,sj->si", R_ref_body, acceleration_body, precision="highest")
+    dt = jnp.where(mask[1:] & mask[:-1], jnp.diff(imu.t), 0)[:, None]
+    mean = (acceleration_ref[1:] + acceleration_ref[:-1]) / 2
+    velocity = jnp.cumsum(mean * dt, axis=0)
+    before = jnp.concatenate([jnp.zeros((1, 3)), velocity[:-1]])
+    position = jnp.cumsum((before + mean * dt / 2) * dt, axis=0)
+    zero = jnp.zeros((1, 3))
+    return Readings(
+        imu, mask, R_ref_body, acceleration_body,
+        jnp.concatenate([zero, velocity]), jnp.concatenate([zero, position]),
+    )  # fmt: skip
+
+
+def no_readings() -> Readings:
+    """The readings where there are none: one masked sample."""
+    zero = jnp.zeros((1, 3))
+    imu = Imu(jnp.zeros(1), zero, zero)
+    return Readings(imu, jnp.zeros(1, bool), jnp.eye(3)[None], zero, zero, zero)
+
+
+def predict(
+    t: float, twist: np.ndarray, velocity_ref: np.ndarray, readings: Readings, *, rotation: bool, speed: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """Stamps (k,) in (0, t] and the motion `T_ref_body` (k, 4, 4) then.
+
+    `twist` is the last frame's motion per second, `velocity_ref` [m/s] how fast the body was at its end. With
+    `rotation` the gyroscope turns the body, with `speed` the accelerometer changes its velocity; without, or
+    where there are no readings, both stay as they were.
+    """
+    stamps = t * np.arange(1, AHEAD + 1) / AHEAD
+    steady = np.asarray(se3.exp(jnp.asarray(stamps[:, None] * twist, jnp.float32)), np.float64)
+    count = int(np.sum(np.asarray(readings.mask)))
+    if not rotation or count < 2:
+        return stamps, steady
+    nearest = np.searchsorted(np.asarray(readings.imu.t)[:count], stamps - 1e-6).clip(0, count - 1)
+    stamps = np.asarray(readings.imu.t, np.float64)[nearest]
+    poses = np.tile(np.eye(4), (AHEAD, 1, 1))
+    poses[:, :3, :3] = np.asarray(readings.R_ref_body)[nearest]
+    poses[:, :3, 3] = stamps[:, None] * velocity_ref
+    if speed:
+        poses[:, :3, 3] += np.asarray(readings.position_ref)[nearest]
+    return stamps, poses
+
+
+def end_velocity(t: float, T_ref_body: np.ndarray, readings: Readings, *, speed: bool) -> np.ndarray:
+    """Velocity [m/s] of the body at the end of an interval over which it moved by `T_ref_body`, in its axes then.
+
+    With `speed`, the mean velocity is carried to the end by the accelerometer.
+    """
+    velocity = T_ref_body[:3, 3] / t
+    count = int(np.sum(np.asarray(readings.mask)))
+    if speed and count > 1:
+        position, gained = (np.asarray(x)[count - 1] for x in (readings.position_ref, readings.velocity_ref))
+        velocity = (T_ref_body[:3, 3] - position) / t + gained
+    return T_ref_body[:3, :3].T @ velocity
