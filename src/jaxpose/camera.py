@@ -6,12 +6,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+Scalar = float | Float[Array, ""]  # traced where a caller optimises the intrinsics
 _NEWTON_STEPS = 6  # quadratic: the corners of EuRoC's and TUM's lenses reach float64 rounding
 _OUTSIDE = -1e6  # [px] where points without a pixel go: outside every image, and finite
 
 
 class Camera(NamedTuple):
-    """Intrinsics [px]; the centre of the first pixel is (0, 0), as in OpenCV.
+    """Intrinsics [px], plain Python numbers; the centre of the first pixel is (0, 0), as in OpenCV.
 
     `distortion` is OpenCV's k1 k2 p1 p2 [k3]; empty for a pinhole, which then pays nothing for it.
     """
@@ -67,7 +68,7 @@ def scale(camera: Camera, factor: float) -> Camera:
     )
 
 
-def _distort(distortion: tuple[float, ...], point: Float[Array, "*n 2"]) -> Float[Array, "*n 2"]:
+def _distort(distortion: tuple[Scalar, ...], point: Float[Array, "*n 2"]) -> Float[Array, "*n 2"]:
     """Where the lens puts an ideal image point at z = 1; raises ValueError unless 0, 4 or 5 coefficients."""
     if not distortion:
         return point
@@ -86,7 +87,7 @@ def _distort(distortion: tuple[float, ...], point: Float[Array, "*n 2"]) -> Floa
     )
 
 
-def _undistort(distortion: tuple[float, ...], distorted: Float[Array, "*n 2"]) -> Float[Array, "*n 2"]:
+def _undistort(distortion: tuple[Scalar, ...], distorted: Float[Array, "*n 2"]) -> Float[Array, "*n 2"]:
     """The inverse of `_distort` by Newton's method, a fixed number of steps."""
     if not distortion:
         return distorted
