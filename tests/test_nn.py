@@ -127,5 +127,5 @@ def test_initial_weights():
         assert 0.97 * bound < np.max(np.abs(kernel)) <= bound
         assert abs(np.std(kernel) / (bound / np.sqrt(3)) - 1) < 0.05
     last = params["layer_5"]["kernel"]
-    assert 0 <= np.min(last) and 0.97e-6 < np.max(last) <= 1e-6
+    assert 0 <= np.min(last) and 0.97e-7 < np.max(last) <= 1e-7
     assert all(np.all(params[f"layer_{i}"]["bias"] == 0) for i in range(6))

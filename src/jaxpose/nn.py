@@ -84,7 +84,7 @@ def mlp(
     """A perceptron of `layers` linear layers (the output counted), Xavier-uniform times `gain`, zero bias.
 
     The input is concatenated again at the input of layer number `skip` (from 0; nothing where there is no
-    such layer). `small_output` draws the last layer from U(0, 1e-6), so that the output starts at zero.
+    such layer). `small_output` draws the last layer from U(0, 1e-7), so that the output starts at zero.
     `precision` is that of the products: "highest" for what is differentiated in time. Parameters have the
     default float type at the time of `init`.
     """
@@ -131,4 +131,4 @@ class _MLP(nn.Module):
 
 
 def _small_uniform(key, shape, dtype):
-    return jax.random.uniform(key, shape, dtype, maxval=1e-6)
+    return jax.random.uniform(key, shape, dtype, maxval=1e-7)

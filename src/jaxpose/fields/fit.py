@@ -9,7 +9,6 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxpose import se3
 from jaxpose.fields.base import Params, PoseField
 
 _DELTA = 1e-2  # [rad or length scales] smaller residuals count by their square, larger by their size
@@ -38,10 +37,11 @@ def fit(
 ) -> FitResult:
     """Fit a field to poses `T_reference_body` at `times` [s] by Adam, in one compiled call.
 
-    The start is `params` (a warm start), else `field.init(key)`. With log(P(t)^-1 T) = [rho, phi] the loss is
-    the mean over poses of a pseudo-Huber function of |rho| / length_scale and of |phi|: `length_scale` [m] is
-    the displacement that matters as much as one radian. Of more than `batch` poses each step takes every
-    k-th, the offset going round.
+    The start is `params` (a warm start), else `field.init(key)`. The loss is the mean over poses of a
+    pseudo-Huber function of distance / length_scale and of the chord 2 sin(angle / 2): `length_scale` [m] is
+    the displacement that matters as much as one radian. (The chord is smooth at half a turn, where the twist
+    log(P(t)^-1 T) jumps, and the same as the angle for small ones.) Of more than `batch` poses each step
+    takes every k-th, the offset going round.
 
     `learning_rate` is a number or a prefix of the parameter tree, such as METHOD's `{"translation": 1e-3,
     "rotation": 2e-4}`; 0 keeps a part as it is. It falls exponentially, to `decay` times itself at the end
@@ -68,8 +68,8 @@ def _fit(field, steps, batch, params, times, poses, rates, decay, length_scale) 
     indices = jnp.arange(0, count, rounds)
 
     def loss(params, times, poses):
-        rho, phi = jnp.split(_residuals(field, params, times, poses), 2, axis=-1)
-        return jnp.mean(_pseudo_huber(rho / length_scale) + _pseudo_huber(phi))
+        distance, chord = _squares(field, params, times, poses)
+        return jnp.mean(_pseudo_huber(distance / length_scale**2) + _pseudo_huber(chord))
 
     def step(carry, number):
         params, state = carry
@@ -82,20 +82,18 @@ def _fit(field, steps, batch, params, times, poses, rates, decay, length_scale) 
         return (params, state), None
 
     (params, _), _ = jax.lax.scan(step, (params, adam.init(params)), jnp.arange(steps))
-    rho, phi = jnp.split(_residuals(field, params, times, poses), 2, axis=-1)
-    return FitResult(params, _rms(rho), jnp.rad2deg(_rms(phi)))
+    distance, chord = _squares(field, params, times, poses)
+    angle = 2 * jnp.arcsin(jnp.minimum(jnp.sqrt(chord) / 2, 1))
+    return FitResult(params, jnp.sqrt(jnp.mean(distance)), jnp.rad2deg(jnp.sqrt(jnp.mean(angle**2))))
 
 
-def _residuals(field, params, times, poses) -> Float[Array, "n 6"]:
-    found = jax.vmap(field.pose, in_axes=(None, 0))(params, times)
-    return se3.log(se3.compose(se3.inverse(found), poses))
+def _squares(field, params, times, poses) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    """Squares of the distance [m] and of the chord of the angle between found and given poses."""
+    error = jax.vmap(field.pose, in_axes=(None, 0))(params, times) - poses
+    return jnp.sum(error[:, :3, 3] ** 2, axis=-1), jnp.sum(error[:, :3, :3] ** 2, axis=(-2, -1)) / 2
 
 
-def _pseudo_huber(x: Float[Array, "n 3"]) -> Float[Array, " n"]:
-    # sqrt(1 + square) - 1, written so that it does not cancel for small residuals.
-    square = jnp.sum(x**2, axis=-1) / _DELTA**2
-    return square / (1 + jnp.sqrt(1 + square))
-
-
-def _rms(x: Float[Array, "n 3"]) -> Float[Array, ""]:
-    return jnp.sqrt(jnp.mean(jnp.sum(x**2, axis=-1)))
+def _pseudo_huber(square: Float[Array, " n"]) -> Float[Array, " n"]:
+    # sqrt(1 + x) - 1, written so that it does not cancel for small residuals.
+    x = square / _DELTA**2
+    return x / (1 + jnp.sqrt(1 + x))

@@ -33,7 +33,7 @@ class PoseNetConfig:
 
 
 def posenet(config: PoseNetConfig = PoseNetConfig()) -> PoseField:  # noqa: B008 - frozen
-    """PoseNet as a pose field; the identity (within 1e-3) at init.
+    """PoseNet as a pose field; the identity (within 2e-4) at init.
 
     The parameters are a dict of one tree of weights per network, `translation` and `rotation` or `coupled`,
     so that optimisers can give each its own rate. With a `window` there is also `progress`, which
