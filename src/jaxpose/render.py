@@ -67,9 +67,7 @@ def sdf_weights(
     return ends * _transmittance(ends)
 
 
-def composite(
-    weights: Float[Array, " s"], depth: Float[Array, " s"], rgb: Float[Array, "s 3"]
-) -> Rendered:
+def composite(weights: Float[Array, " s"], depth: Float[Array, " s"], rgb: Float[Array, "s 3"]) -> Rendered:
     """Expected colour, depth and variance of depth under the weights (NICE-SLAM, eqs. 6 and 7, normalised)."""
     opacity = jnp.sum(weights)
     share = weights / (opacity + 1e-6)

@@ -6,3 +6,4 @@ from jaxpose.scenes.grid import box as box
 from jaxpose.scenes.grid import grid as grid
 from jaxpose.scenes.grid import grow as grow
 from jaxpose.scenes.grid import merge as merge
+from jaxpose.scenes.grid import node_positions as node_positions

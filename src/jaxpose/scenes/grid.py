@@ -6,6 +6,7 @@ seen, and the levels can be merged into the finest one without changing a single
 """
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -32,7 +33,9 @@ class GridConfig:
         if not all(low < high for low, high in zip(self.lower, self.upper, strict=True)):
             raise ValueError(f"GridConfig: expected lower < upper, got {self.lower} and {self.upper}")
         if self.voxel <= 0 or self.levels < 1:
-            raise ValueError(f"GridConfig: expected voxel > 0 and levels >= 1, got {self.voxel}, {self.levels}")
+            raise ValueError(
+                f"GridConfig: expected voxel > 0 and levels >= 1, got {self.voxel}, {self.levels}"
+            )
 
 
 def grid(config: GridConfig) -> SceneField:
@@ -42,14 +45,12 @@ def grid(config: GridConfig) -> SceneField:
     value of the nearest face holds.
     """
     lower = np.asarray(config.lower, np.float32)
-    sides = np.asarray(config.upper, np.float32) - lower
-    coarse_cells = np.ceil(sides / (config.voxel * RATIO ** (config.levels - 1)) - 1e-4).astype(int)
+    coarse_cells = _coarse_cells(config)
 
     def init(key):
         del key  # nothing is random: free space, grey
         shapes = [tuple(coarse_cells * RATIO**level + 1) + (_CHANNELS,) for level in range(config.levels)]
-        start = jnp.array([config.truncation, 0.5, 0.5, 0.5])
-        return (jnp.broadcast_to(start, shapes[0]), *(jnp.zeros(shape) for shape in shapes[1:]))
+        return (jnp.broadcast_to(_free(config), shapes[0]), *(jnp.zeros(shape) for shape in shapes[1:]))
 
     def query(params, point, direction):
         del direction  # surfaces are taken as matt
@@ -57,14 +58,17 @@ def grid(config: GridConfig) -> SceneField:
         steps = [RATIO ** (config.levels - 1 - level) for level in range(config.levels)]
         # A merged scene has one level, the finest.
         value = sum(
-            _trilinear(level, position / step) for level, step in zip(params, steps[-len(params) :], strict=True)
+            _trilinear(level, position / step)
+            for level, step in zip(params, steps[-len(params) :], strict=True)
         )
         return value[0], value[1:]
 
     return SceneField(init, query)
 
 
-def box(points: np.ndarray, *, voxel: float | None = None, levels: int = 2, nodes: int = 400_000) -> GridConfig:
+def box(
+    points: np.ndarray, *, voxel: float | None = None, levels: int = 2, nodes: int = 400_000
+) -> GridConfig:
     """A grid around world points (n, 3) [m], a quarter of its size wider on every side, of about `nodes` nodes.
 
     With `voxel` [m] given, the number of nodes follows instead.
@@ -79,29 +83,35 @@ def box(points: np.ndarray, *, voxel: float | None = None, levels: int = 2, node
     return GridConfig(_triple(lower), _triple(upper), voxel, levels, 3 * voxel)
 
 
-def grow(config: GridConfig, params: Params, points: np.ndarray, *, fill: bool = True):
-    """The grid enlarged to hold more world points (n, 3) [m]: `(config, params)`, nodes where they were.
+def grow(config: GridConfig, state: Any, points: np.ndarray) -> tuple[GridConfig, Any]:
+    """The grid enlarged to hold more world points (n, 3) [m], nodes where they were, new space free.
 
-    New space is free. With `fill=False` it is zero, as moments of an optimiser want it.
+    `state` is any pytree that holds the parameters under the attribute `params` and arrays shaped like them,
+    (x, y, z, c), elsewhere: moments of an optimiser, say, which are zero in the new space.
     """
     cell = config.voxel * RATIO ** (config.levels - 1)
     lower, upper = np.array(config.lower), np.array(config.upper)
-    margin = 0.1 * (upper - lower)
-    before = np.ceil(np.maximum(lower - points.min(axis=0) + margin, 0) / cell).astype(int)
-    before = np.where(points.min(axis=0) < lower, before, 0)
-    after = np.ceil(np.maximum(points.max(axis=0) - upper + margin, 0) / cell).astype(int)
-    after = np.where(points.max(axis=0) > upper, after, 0)
-    start = (config.truncation, 0.5, 0.5, 0.5)
-    levels = []
-    for level, values in enumerate(params):
-        nodes = [(int(b), int(a)) for b, a in zip(before * RATIO**level, after * RATIO**level, strict=True)]
-        channels = [
-            jnp.pad(values[..., c], nodes, constant_values=start[c] if fill and level == 0 else 0.0)
-            for c in range(_CHANNELS)
-        ]
-        levels.append(jnp.stack(channels, axis=-1))
+    low, high = points.min(axis=0), points.max(axis=0)
+    margin = 0.15 * (upper - lower)
+    before = np.where(low < lower, np.ceil((lower - low + margin) / cell), 0).astype(int)
+    after = np.where(high > upper, np.ceil((high - upper + margin) / cell), 0).astype(int)
+    widths = {
+        values.shape[:3]: [(int(b), int(a)) for b, a in zip(before * k, after * k, strict=True)] + [(0, 0)]
+        for k, values in zip((RATIO**level for level in range(config.levels)), state.params, strict=True)
+    }
+    pad = lambda x: jnp.pad(x, widths[x.shape[:3]]) if x.ndim == 4 else x
+    larger = jax.tree.map(pad, state)
     config = replace(config, lower=_triple(lower - before * cell), upper=_triple(upper + after * cell))
-    return config, tuple(levels)
+    free = _free(config)
+    coarse = pad(state.params[0] - free) + free
+    return config, larger._replace(params=(coarse, *larger.params[1:]))
+
+
+def node_positions(config: GridConfig) -> Float[np.ndarray, "x y z 3"]:
+    """World positions [m] of the nodes of the finest level."""
+    cells = _coarse_cells(config) * RATIO ** (config.levels - 1)
+    axes = [low + config.voxel * np.arange(n + 1) for low, n in zip(config.lower, cells, strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).astype(np.float32)
 
 
 def merge(params: Params) -> Params:
@@ -115,6 +125,16 @@ def merge(params: Params) -> Params:
             total = _refine(total, axis)
         total = total + level
     return (total,)
+
+
+def _coarse_cells(config: GridConfig) -> np.ndarray:
+    sides = np.asarray(config.upper) - np.asarray(config.lower)
+    return np.ceil(sides / (config.voxel * RATIO ** (config.levels - 1)) - 1e-4).astype(int)
+
+
+def _free(config: GridConfig) -> Float[Array, "1 1 1 4"]:
+    """What stands where nothing was seen: free space, grey."""
+    return jnp.array([config.truncation, 0.5, 0.5, 0.5])[None, None, None]
 
 
 def _refine(values: Float[Array, "x y z c"], axis: int) -> Float[Array, "_ _ _ c"]:

@@ -54,7 +54,11 @@ def make_field(name: FrameName, config: PoseNetConfig, interval_s: float, durati
 
 
 def gauge(
-    name: FrameName, t_s: float, T_world_ref: np.ndarray, T_world_first: np.ndarray, generator: np.random.Generator
+    name: FrameName,
+    t_s: float,
+    T_world_ref: np.ndarray,
+    T_world_first: np.ndarray,
+    generator: np.random.Generator,
 ) -> Gauge:
     """The gauge at a last frame at `t_s` seconds: poses of the body there and at the first frame."""
     T_ref_field = np.eye(4)

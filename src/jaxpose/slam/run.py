@@ -19,7 +19,7 @@ from jaxpose.recording import Frame, Recording
 from jaxpose.scenes import GridConfig, SceneField, box, grid, grow, merge
 from jaxpose.slam.frames import FrameName, gauge, make_field
 from jaxpose.slam.keyframes import Keyframe, choose, overlap
-from jaxpose.slam.mapping import MapConfig, MapState, make_map
+from jaxpose.slam.mapping import MapConfig, MapState, make_descend, make_fuse
 from jaxpose.slam.observe import Image
 from jaxpose.slam.predict import (
     BEHIND, Interval, Readings, end_velocity, integrate, no_readings, predict,
@@ -99,7 +99,9 @@ class _World(NamedTuple):
 
 
 def run(
-    recording: Recording, config: SlamConfig = SlamConfig(), on_frame: Callable[[Progress], None] | None = None
+    recording: Recording,
+    config: SlamConfig = SlamConfig(),
+    on_frame: Callable[[Progress], None] | None = None,
 ) -> SlamResult:
     """Track every frame of an RGB-D recording and map what it sees (paper section 3.4, METHOD section 5).
 
@@ -134,9 +136,7 @@ def run(
         if world is not None:
             dt = float(t[i] - t[i - 1])
             readings = windows(i - 1, T_world_body[-1])
-            interval, predicted = _interval(
-                dt, T_world_body, t[: i], twist, velocity, readings, config.imu
-            )
+            interval, predicted = _interval(dt, T_world_body, t[:i], twist, velocity, readings, config.imu)
             where = gauge(config.frame, float(t[i - 1] - t[0]), T_world_body[-1], T_world_body[0], generator)
             tracked = world.track(
                 world.merged, params, jnp.asarray(T_world_body[-1], jnp.float32), where, interval, image,
@@ -149,13 +149,21 @@ def run(
             T_world_body.append(_orthonormal(T_world_body[-1] @ T_ref_body))
             T_world_cam.append(T_world_body[-1] @ T_body_cam)
             twist = np.asarray(se3.log(jnp.asarray(T_ref_body, jnp.float32)), np.float64) / dt
-            velocity = end_velocity(dt, T_ref_body, readings, speed=config.imu in ("accelerometer", "combined"))
+            velocity = end_velocity(
+                dt, T_ref_body, readings, speed=config.imu in ("accelerometer", "combined")
+            )
 
         if not lost and t[i] - mapped_at >= config.map_every_s:
             points = _points(frame, recording, T_world_cam[-1])
-            far = max(far, 1.2 * float(np.percentile(np.linalg.norm(points - T_world_cam[-1][:3, 3], axis=1), 99)))
+            far = max(
+                far, 1.2 * float(np.percentile(np.linalg.norm(points - T_world_cam[-1][:3, 3], axis=1), 99))
+            )
             world = _room_for(points, world, config, compile_world)
-            shares = overlap(points, np.stack([k.T_world_cam for k in keyframes]), recording.camera) if keyframes else np.zeros(0)
+            shares = (
+                overlap(points, np.stack([k.T_world_cam for k in keyframes]), recording.camera)
+                if keyframes
+                else np.zeros(0)
+            )
             world = _mapped(world, image, T_world_cam[-1], keyframes, shares, far, config, generator, map_key)
             mapped_at = t[i]
             if not keyframes or shares.max() < config.keyframe_overlap:
@@ -239,8 +247,13 @@ def _compile(recording, config, field, motion, grid_config: GridConfig, state: M
     scene = grid(grid_config)
     scale = dict(band=grid_config.truncation, width=grid_config.truncation / 8)
     map_config = replace(config.map, sample=replace(config.map.sample, **scale))
+    fused = config.map.method == "fused"
     track_config = replace(config.track, sample=replace(config.track.sample, **scale))
-    init_map, update = make_map(scene, recording.camera, map_config)
+    init_map, update = (
+        make_fuse(grid_config, recording.camera, grid_config.truncation)
+        if fused
+        else make_descend(scene, recording.camera, map_config)
+    )
     weights = IMU_WEIGHTS[config.imu]
     sigmas = _sigmas(recording, config)
     T_body_cam = jnp.asarray(recording.T_body_cam, jnp.float32)
@@ -266,17 +279,18 @@ def _room_for(points, world: _World | None, config: SlamConfig, compile_world) -
     lower, upper = np.percentile(points, [1, 99], axis=0)
     corners = np.stack([lower, upper])
     if world is None:
-        return compile_world(box(corners, voxel=config.voxel), None)
+        levels = 1 if config.map.method == "fused" else 2
+        return compile_world(box(corners, voxel=config.voxel, levels=levels), None)
     if (lower >= world.grid.lower).all() and (upper <= world.grid.upper).all():
         return world
-    params, adam = world.state
-    larger, params = grow(world.grid, params, corners)
-    moments = {name: grow(world.grid, getattr(adam, name), corners, fill=False)[1] for name in ("mu", "nu")}
-    return compile_world(larger, MapState(params, adam._replace(**moments)))
+    return compile_world(*grow(world.grid, world.state, corners))
 
 
 def _mapped(world, image, T_world_cam, keyframes, shares, far, config, generator, key) -> _World:
     """The world after a mapping step on this frame and keyframes that overlap it."""
+    if config.map.method == "fused":
+        state = world.update(world.state, image, jnp.asarray(T_world_cam, jnp.float32))
+        return world._replace(state=state, merged=state.params)
     first = not keyframes
     others = [] if first else [keyframes[k] for k in choose(shares, config.map.window - 1, generator)]
     images = [image] * config.map.window if first else [image, *(k.image for k in others)]

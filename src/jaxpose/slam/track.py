@@ -63,8 +63,6 @@ class Tracked(NamedTuple):
     iterations: Int[Array, ""]
 
 
-
-
 def render_loss(
     query, T_world_cam: Float[Array, "4 4"], pixels: Pixels, far: Float[Array, ""], config: TrackConfig
 ) -> tuple[Float[Array, ""], tuple[Float[Array, ""], Float[Array, ""]]]:
@@ -93,11 +91,17 @@ def imu_loss(
     motion: PoseFn, interval: Interval, weights: ImuWeights, sigmas: ResidualSigmas
 ) -> Float[Array, ""]:
     """The weighted inertial L1 losses, each in units of its sigma, as means over readings and axes."""
-    mask = jnp.broadcast_to(interval.readings.mask[:, None], (interval.readings.mask.shape[0], 3)).astype(jnp.float32)
+    mask = jnp.broadcast_to(interval.readings.mask[:, None], (interval.readings.mask.shape[0], 3)).astype(
+        jnp.float32
+    )
     times = jnp.where(interval.readings.mask, interval.readings.imu.t, 0)
     if weights.accelerometer:
         residuals = inertial.imu_residuals(
-            motion, times, interval.readings.imu.omega_body, interval.readings.acceleration_body, interval.readings.R_ref_body
+            motion,
+            times,
+            interval.readings.imu.omega_body,
+            interval.readings.acceleration_body,
+            interval.readings.R_ref_body,
         )
         terms = residuals._asdict()
     else:
