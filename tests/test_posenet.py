@@ -201,6 +201,36 @@ def test_times_pass_the_network_as_one_matrix():
         assert product.invars[0].aval.shape[0] == 50
 
 
+def flops(function, *arguments):
+    """What the compiled function computes, after dead code is gone."""
+    return jax.jit(function).lower(*arguments).compile().cost_analysis()["flops"]
+
+
+def test_losses_on_translation_do_not_pay_for_rotation():
+    field = posenet(PoseNetConfig(layers=4, width=64))
+    params, times = random_params(field), jnp.linspace(-1, 1, 32)
+
+    def loss(params, stop=False):
+        pose = partial(field.pose, fields.stop_rotation(params) if stop else params)
+        return jnp.sum(jax.vmap(lambda t: pose(t)[:3, 3])(times) ** 2)
+
+    both = flops(lambda params: jax.vmap(partial(field.pose, params))(times), params)
+    assert flops(loss, params) < 0.6 * both, "the forward pass of one network"
+    assert flops(jax.grad(partial(loss, stop=True)), params) < 0.6 * flops(jax.grad(loss), params)
+    whole, stopped = jax.jit(jax.grad(loss))(params), jax.jit(jax.grad(partial(loss, stop=True)))(params)
+    assert_allclose(
+        stopped["translation"]["layer_0"]["kernel"], whole["translation"]["layer_0"]["kernel"], rtol=1e-5
+    )
+    assert all(np.all(leaf == 0) for leaf in jax.tree.leaves((stopped["rotation"], whole["rotation"])))
+
+
+def test_stopping_the_rotation_leaves_other_parameters_alone():
+    coupled = random_params(posenet(PoseNetConfig(coupled=True, **SMALL)))
+    assert fields.stop_rotation(coupled) is coupled
+    control_poses = jnp.zeros((5, 7))
+    assert fields.stop_rotation(control_poses) is control_poses
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -16,4 +16,5 @@ from jaxpose.fields.fit import fit as fit
 from jaxpose.fields.posenet import PoseNetConfig as PoseNetConfig
 from jaxpose.fields.posenet import posenet as posenet
 from jaxpose.fields.posenet import set_progress as set_progress
+from jaxpose.fields.posenet import stop_rotation as stop_rotation
 from jaxpose.fields.table import table as table

@@ -68,8 +68,10 @@ def posenet(config: PoseNetConfig = PoseNetConfig()) -> PoseField:  # noqa: B008
             progress = jax.lax.stop_gradient(params["progress"])
             weights = nn.window_weights(progress, config.octaves, config.window)
         features = nn.frequency_encoding(tau[None], config.octaves, weights=weights)
-        out = jnp.concatenate([network.apply(params[name], features) for name, network in networks.items()])
-        return _head(config, out)
+        outputs = {name: network.apply(params[name], features) for name, network in networks.items()}
+        if config.coupled:
+            outputs = {"translation": outputs["coupled"][:3], "rotation": outputs["coupled"][3:]}
+        return _head(config, **outputs)
 
     return PoseField(init, pose)
 
@@ -79,14 +81,26 @@ def set_progress(params: Params, progress: Float[Array, ""]) -> Params:
     return params | {"progress": progress}
 
 
-def _head(config: PoseNetConfig, out: Float[Array, "7"]) -> Float[Array, "4 4"]:
+def stop_rotation(params: Params) -> Params:
+    """The same parameters with no gradient to a decoupled PoseNet's rotation network; others as they are.
+
+    For losses on translation alone: differentiating `pose(t)[:3, 3]` takes the zeros that are the rotation's
+    gradient all the way back through its network, which doubles the cost of an accelerometer loss.
+    """
+    if not (isinstance(params, dict) and "rotation" in params):
+        return params
+    return params | {"rotation": jax.lax.stop_gradient(params["rotation"])}
+
+
+def _head(
+    config: PoseNetConfig, translation: Float[Array, "3"], rotation: Float[Array, "4"]
+) -> Float[Array, "4 4"]:
+    # The two are never put into one array, so that whoever asks for one does not compute the other.
     if config.head == "paper":
-        out = jnp.tanh(out)
-        sign = jnp.asarray([-1, 1, 1, 1], out.dtype)
-    else:
-        sign = jnp.ones(4, out.dtype)
-    quaternion = jnp.asarray([1, 0, 0, 0], out.dtype) + sign * out[3:]
-    return se3.make(se3.quaternion_to_rotation(quaternion), config.translation_scale * out[:3])
+        translation, rotation = jnp.tanh(translation), jnp.tanh(rotation)
+        rotation = rotation * jnp.asarray([-1, 1, 1, 1], rotation.dtype)
+    quaternion = rotation + jnp.asarray([1, 0, 0, 0], rotation.dtype)
+    return se3.make(se3.quaternion_to_rotation(quaternion), config.translation_scale * translation)
 
 
 def _check(config: PoseNetConfig) -> None:
