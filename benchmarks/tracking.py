@@ -1,0 +1,116 @@
+"""Cost of one tracking iteration with NICE-SLAM's Replica work: 200 rays x 48 samples, 16 of them at the surface.
+
+An iteration draws pixels, renders them, takes the gradient of the loss and one step of Adam. What is
+optimised is either six free numbers (a twist) or a PoseNet; iterations run inside one compiled loop.
+
+    python benchmarks/tracking.py --help
+"""
+
+from dataclasses import dataclass
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import tyro
+from timing import in_turn, machine, milliseconds
+
+from jaxpose import se3
+from jaxpose.camera import Camera
+from jaxpose.fields import PoseNetConfig, posenet
+from jaxpose.scenes import box, grid, node_positions
+from jaxpose.slam.objective import TrackConfig, image_loss, image_residuals
+from jaxpose.slam.observe import Image, SampleConfig, sample_pixels
+
+CAMERA = Camera(585.0, 585.0, 320.0, 240.0, 640, 480)
+HALF = np.array([2.5, 1.5, 3.0])  # [m] of the room, whose centre is where the camera is
+
+
+@dataclass(frozen=True)
+class Config:
+    """How long to measure."""
+
+    iterations: int = 100  # inside one compiled call
+    repeats: int = 15
+    rays: int = 200
+    even: int = 32  # samples in front of the surface
+    near: int = 16  # samples through it
+
+
+def room() -> tuple:
+    """A box-shaped room of coloured walls on about 400,000 nodes: the scene, its parameters, one image."""
+    config = box(np.stack([-HALF, HALF]), levels=1)
+    nodes = node_positions(config)
+    distance = np.clip((HALF - np.abs(nodes)).min(axis=-1), -config.truncation, config.truncation)
+    values = np.concatenate([distance[..., None], colour(nodes)], axis=-1)
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+    x, y = (u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy
+    direction = np.stack([x, y, np.ones_like(x)], axis=-1)
+    depth = (HALF / np.maximum(np.abs(direction), 1e-9)).min(axis=-1)
+    rgb = (255 * colour(depth[..., None] * direction)).astype(np.uint8)
+    image = Image(jnp.asarray(rgb), jnp.asarray(depth, jnp.float32))
+    return grid(config), (jnp.asarray(values, jnp.float32),), image
+
+
+def colour(point: np.ndarray) -> np.ndarray:
+    return 0.5 + 0.4 * np.sin(3 * point)
+
+
+def make_loop(scene, pose_of, config: Config):
+    """The compiled loop `(parameters, scene parameters, image, key) -> (parameters, last loss)`."""
+    track = TrackConfig(
+        pixels=config.rays, sample=SampleConfig(front=config.even, surface=config.near, behind=0)
+    )
+    adam = optax.adam(1e-4)
+
+    def loss_fn(params, scene_params, image, key):
+        pixels = sample_pixels(key, image, CAMERA, track.pixels, edge=track.edge)
+        query = partial(scene.query, scene_params)
+        return image_loss(image_residuals(query, pose_of(params), pixels, jnp.float32(8.0), track), track)
+
+    @jax.jit
+    def loop(params, scene_params, image, key):
+        def improve(carry, key):
+            params, state = carry
+            loss, gradient = jax.value_and_grad(loss_fn)(params, scene_params, image, key)
+            updates, state = adam.update(gradient, state)
+            return (optax.apply_updates(params, updates), state), loss
+
+        keys = jax.random.split(key, config.iterations)
+        (params, _), losses = jax.lax.scan(improve, (params, adam.init(params)), keys)
+        return params, losses[-1]
+
+    return loop
+
+
+def main() -> None:
+    config = tyro.cli(Config, description=__doc__)
+    scene, scene_params, image = room()
+    key = jax.random.key(0)
+    fields = {
+        "PoseNet 4 x 128 softplus": PoseNetConfig(layers=4, width=128, activation="softplus"),
+        "PoseNet 8 x 256 relu": PoseNetConfig(),
+    }
+    start = jnp.array([0.02, -0.01, 0.03, 0.01, -0.02, 0.01])
+    variants = {"six numbers": (lambda twist: se3.exp(twist), start)}
+    for name, settings in fields.items():
+        field = posenet(settings)
+        variants[name] = (lambda params, field=field: field.pose(params, jnp.float32(0.5)), field.init(key))
+    loops = {
+        name: partial(make_loop(scene, pose_of, config), params, scene_params, image, key)
+        for name, (pose_of, params) in variants.items()
+    }
+    times = {name: taken / config.iterations for name, taken in in_turn(loops, config.repeats).items()}
+    print(machine())
+    nodes = scene_params[0][..., 0].size
+    print(f"{config.rays} rays x {config.even + config.near} samples, {nodes} nodes, per iteration:")
+    for name, taken in times.items():
+        print(f"  {name:26s}{milliseconds(taken)}")
+    for name in fields:
+        # Differences of neighbours in time: what drifts goes out.
+        print(f"  {name + ' adds':31s}{milliseconds(times[name] - times['six numbers'])}")
+
+
+if __name__ == "__main__":
+    main()
