@@ -1,7 +1,7 @@
 """Volume rendering of one ray through any scene; the caller vmaps.
 
-A scene enters as a callable `query(point, direction) -> (geometry, rgb)`. What geometry means is settled by the
-weights given to `render_ray`: a density (NeRF), an occupancy (NICE-SLAM) or a signed distance.
+A scene enters as a callable `query(point, direction) -> (geometry, rgb)`. What geometry means is settled by
+the weights given to `render_ray`: a density (NeRF), an occupancy (NICE-SLAM) or a signed distance.
 """
 
 from collections.abc import Callable
@@ -68,7 +68,7 @@ def sdf_weights(
 
 
 def composite(weights: Float[Array, " s"], depth: Float[Array, " s"], rgb: Float[Array, "s 3"]) -> Rendered:
-    """Expected colour, depth and variance of depth under the weights (NICE-SLAM, eqs. 6 and 7, normalised)."""
+    """Expected colour, depth and variance of depth under the weights (NICE-SLAM, eqs. 6-7, normalised)."""
     opacity = jnp.sum(weights)
     share = weights / (opacity + 1e-6)
     mean = jnp.sum(share * depth)
@@ -94,6 +94,6 @@ def _before(x: Float[Array, " s"]) -> Float[Array, " s"]:
 
 
 def _transmittance(ends: Float[Array, " s"]) -> Float[Array, " s"]:
-    """Probability of reaching each sample, given that of ending at each; 1e-10 as in NICE-SLAM keeps gradients."""
+    """Probability of reaching each sample, given that of ending at each; 1e-10 keeps gradients (NICE-SLAM)."""
     passed = jnp.cumprod(1 - ends + 1e-10)
     return jnp.concatenate([jnp.ones_like(passed[:1]), passed[:-1]])

@@ -1,8 +1,8 @@
 """Multi-resolution feature grids of signed distance and colour: a scene that trains in seconds on a CPU.
 
 The features are the values themselves, summed over levels whose nodes are nested (one cell of a level holds
-`RATIO`^3 of the next), so that no decoder needs pretrained weights, a coarse level fills in what few rays have
-seen, and the levels can be merged into the finest one without changing a single value (`merge`).
+`RATIO`^3 of the next), so that no decoder needs pretrained weights, a coarse level fills in what few rays
+have seen, and the levels can be merged into the finest one without changing a single value (`merge`).
 """
 
 from dataclasses import dataclass, replace
@@ -39,10 +39,10 @@ class GridConfig:
 
 
 def grid(config: GridConfig) -> SceneField:
-    """Signed distance [m] (positive in front of surfaces) and colour on nested grids; trilinear between nodes.
+    """Signed distance [m], positive in front of surfaces, and colour on nested grids, trilinear between nodes.
 
-    Parameters are a tuple of arrays (x, y, z, 4), coarsest first; the colour is not squashed. Outside the box the
-    value of the nearest face holds.
+    Parameters are a tuple of arrays (x, y, z, 4), coarsest first; the colour is not squashed. Outside the box
+    the value of the nearest face holds.
     """
     lower = np.asarray(config.lower, np.float32)
     coarse_cells = _coarse_cells(config)
@@ -69,9 +69,9 @@ def grid(config: GridConfig) -> SceneField:
 def box(
     points: np.ndarray, *, voxel: float | None = None, levels: int = 2, nodes: int = 400_000
 ) -> GridConfig:
-    """A grid around world points (n, 3) [m], a quarter of its size wider on every side, of about `nodes` nodes.
+    """A grid around world points (n, 3) [m], a quarter of its size wider on every side.
 
-    With `voxel` [m] given, the number of nodes follows instead.
+    It has about `nodes` nodes, or as many as `voxel` [m] asks for.
     """
     lower, upper = points.min(axis=0), points.max(axis=0)
     margin = 0.25 * (upper - lower) + 0.2
@@ -117,7 +117,7 @@ def node_positions(config: GridConfig) -> Float[np.ndarray, "x y z 3"]:
 def merge(params: Params) -> Params:
     """The same scene with all levels summed into the finest one: cheaper to query, and equal everywhere.
 
-    Equal because the cells are nested: a trilinear function of a coarse cell is trilinear in each cell within.
+    Equal because the cells are nested: a trilinear function of a coarse cell is so in each cell within.
     """
     total = params[0]
     for level in params[1:]:
@@ -149,8 +149,8 @@ def _refine(values: Float[Array, "x y z c"], axis: int) -> Float[Array, "_ _ _ c
     )
 
 
-def _trilinear(values: Float[Array, "x y z c"], position: Float[Array, "3"]) -> Float[Array, "c"]:
-    """Value at a position in cells. Four rows of two nodes are read: on a CPU the fastest of the ways tried."""
+def _trilinear(values: Float[Array, "x y z c"], position: Float[Array, "3"]) -> Float[Array, " c"]:
+    """Value at a position in cells. Four rows of two nodes: on a CPU the fastest of the ways tried."""
     nodes = values.shape[:3]
     channels = values.shape[3]
     cell = jnp.floor(jax.lax.stop_gradient(position))
@@ -158,13 +158,19 @@ def _trilinear(values: Float[Array, "x y z c"], position: Float[Array, "3"]) -> 
     fraction = jnp.clip(position - cell, 0, 1)
     i, j, k = cell.astype(jnp.int32)
     flat = values.reshape(-1)
-    total = jnp.zeros(channels, values.dtype)
-    for a, b in ((0, 0), (0, 1), (1, 0), (1, 1)):
+
+    def along_z(a, b):
         start = (((i + a) * nodes[1] + j + b) * nodes[2] + k) * channels
         row = jax.lax.dynamic_slice(flat, (start,), (2 * channels,))
-        weight = (fraction[0] if a else 1 - fraction[0]) * (fraction[1] if b else 1 - fraction[1])
-        total = total + weight * (row[:channels] + (row[channels:] - row[:channels]) * fraction[2])
-    return total
+        return _between(row[:channels], row[channels:], fraction[2])
+
+    low = _between(along_z(0, 0), along_z(0, 1), fraction[1])
+    high = _between(along_z(1, 0), along_z(1, 1), fraction[1])
+    return _between(low, high, fraction[0])
+
+
+def _between(a: Float[Array, " c"], b: Float[Array, " c"], fraction: Float[Array, ""]) -> Float[Array, " c"]:
+    return a + (b - a) * fraction
 
 
 def _triple(x: np.ndarray) -> tuple[float, float, float]:

@@ -19,7 +19,7 @@ class Keyframe(NamedTuple):
 def overlap(
     points_world: np.ndarray, T_world_cam: np.ndarray, camera: Camera, *, margin: int = 20
 ) -> np.ndarray:
-    """Share of world points (n, 3) that each of the cameras (k, 4, 4) has in its image, (k,) (NICE-SLAM's test).
+    """Share (k,) of world points (n, 3) that each of the cameras (k, 4, 4) sees (NICE-SLAM's test).
 
     The lens' distortion is left out, which is exact enough for a share.
     """

@@ -1,4 +1,4 @@
-"""Pixels of an RGB-D frame as rays, where along them to sample the scene, and what a sensor's depth is worth."""
+"""Pixels of an RGB-D frame as rays, where along them to sample the scene, what a sensor's depth is worth."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -24,13 +24,13 @@ class Pixels(NamedTuple):
     """Pixels of an image: rays in camera axes (z = 1), measured depth [m] (0: none) and colour in [0, 1]."""
 
     direction_cam: Float[Array, "n 3"]
-    depth: Float[Array, "n"]
+    depth: Float[Array, " n"]
     rgb: Float[Array, "n 3"]
 
 
 @dataclass(frozen=True)
 class SampleConfig:
-    """Samples along a ray: evenly from the camera to the measured surface, denser through it, a few behind."""
+    """Samples along a ray: evenly up to the measured surface, denser through it, a few behind."""
 
     front: int = 12
     surface: int = 16
