@@ -1,8 +1,8 @@
 """Cost of a training step of the accelerometer loss: second time derivatives of a PoseNet's translation.
 
 A step is the L1 loss of `accelerometer_residual` at 4096 times, its gradient, and Adam. The loss does not
-depend on RotsNet, but that cannot be seen through a pose matrix: with all parameters differentiated, as much is
-computed for RotsNet's zero gradient as for TransNet's. Where the accelerometer stands alone, differentiate
+depend on RotsNet, but that cannot be seen through a pose matrix: with all parameters differentiated, as much
+is computed for RotsNet's zero gradient as for TransNet's. Where the accelerometer stands alone, differentiate
 TransNet alone.
 
     python benchmarks/accelerometer.py --help

@@ -1,4 +1,4 @@
-"""Cost of one tracking iteration with NICE-SLAM's Replica work: 200 rays x 48 samples, 16 of them at the surface.
+"""Cost of one tracking iteration with NICE-SLAM's Replica work: 200 rays x 48 samples, 16 at the surface.
 
 An iteration draws pixels, renders them, takes the gradient of the loss and one step of Adam. What is
 optimised is either six free numbers (a twist) or a PoseNet; iterations run inside one compiled loop.

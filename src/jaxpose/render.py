@@ -94,6 +94,6 @@ def _before(x: Float[Array, " s"]) -> Float[Array, " s"]:
 
 
 def _transmittance(ends: Float[Array, " s"]) -> Float[Array, " s"]:
-    """Probability of reaching each sample, given that of ending at each; 1e-10 keeps gradients (NICE-SLAM)."""
+    """Probability of reaching each sample, given that of ending at each; 1e-10 as in NICE-SLAM."""
     passed = jnp.cumprod(1 - ends + 1e-10)
     return jnp.concatenate([jnp.ones_like(passed[:1]), passed[:-1]])

@@ -39,10 +39,10 @@ class GridConfig:
 
 
 def grid(config: GridConfig) -> SceneField:
-    """Signed distance [m], positive in front of surfaces, and colour on nested grids, trilinear between nodes.
+    """Signed distance [m], positive in front of surfaces, and colour on nested grids.
 
-    Parameters are a tuple of arrays (x, y, z, 4), coarsest first; the colour is not squashed. Outside the box
-    the value of the nearest face holds.
+    Trilinear between nodes; outside the box the value of the nearest face holds. Parameters are a tuple of
+    arrays (x, y, z, 4), coarsest first; the colour is not squashed.
     """
     lower = np.asarray(config.lower, np.float32)
     coarse_cells = _coarse_cells(config)
