@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxpose import se3
 from jaxpose.fields import bspline, control_points
-from jaxpose.motion import motion
+from jaxpose.motion import motion, velocity
 
 SCREW = np.array([1.5, 1.0, 4.0, 1.0, 5.5, 2.0])  # 5.9 rad/s: once past 180 degrees in a second
 FIRST, LAST, INTERVALS = 2.0, 3.0, 20
@@ -149,14 +149,16 @@ def test_zero_parameters_are_the_identity_at_rest(dtype):
     assert_allclose(np.concatenate(found[1:], axis=-1), 0)
 
 
-def test_gradients_are_those_of_finite_differences():
-    """With respect to the control poses, at zero too, of the pose and of its accelerations."""
+@pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_gradients_are_those_of_finite_differences(order):
+    """With respect to the control poses, at zero too, of the pose and of its rates or accelerations."""
     field = bspline((0.0, 3.0), 3)
     weights = np.random.default_rng(1).normal(size=(4, 4))
 
     def value(params):
-        found = motion(partial(field.pose, params), jnp.asarray(1.3))
-        return jnp.sum(weights * found.pose) + jnp.sum(found.acceleration_world + found.alpha_body)
+        found = (velocity if order == 1 else motion)(partial(field.pose, params), jnp.asarray(1.3))
+        linear, angular = found[2 * order - 1 :]
+        return jnp.sum(weights * found[0]) + jnp.sum(linear + angular)
 
     with jax.enable_x64(True):
         gradient_of, several = jax.jit(jax.grad(value)), jax.jit(jax.vmap(value))
