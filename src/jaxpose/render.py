@@ -89,8 +89,8 @@ def surface_weights(width: float) -> Weights:
 
 
 def _before(x: Float[Array, " s"]) -> Float[Array, " s"]:
-    """Sum over the samples before each one."""
-    return jnp.cumsum(x) - x
+    """Sum over the samples before each one; the last, which may be huge, is in none of them."""
+    return jnp.concatenate([jnp.zeros_like(x[:1]), jnp.cumsum(x[:-1])])
 
 
 def _transmittance(ends: Float[Array, " s"]) -> Float[Array, " s"]:

@@ -3,8 +3,8 @@
 Two ways. `gradient` is the paper's: the scene is optimised on rays of the current frame and of keyframes that
 see the same place. `fused` solves for the signed distance in closed form: at every node of the grid the
 weighted mean of all distances measured along the optical axis, which is what the gradient's L2 loss tends to
-when every frame is seen equally often (Curless and Levoy 1996). It has no step size, forgets nothing and costs
-one pass over the grid; the figures of both are in experiments/.
+when every frame is seen equally often (Curless and Levoy 1996). It has no step size, forgets nothing and
+costs one pass over the grid; the figures of both are in experiments/.
 """
 
 from dataclasses import dataclass
