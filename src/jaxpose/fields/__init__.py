@@ -13,6 +13,7 @@ from jaxpose.fields.composition import refine as refine
 from jaxpose.fields.composition import stamped as stamped
 from jaxpose.fields.fit import FitResult as FitResult
 from jaxpose.fields.fit import fit as fit
+from jaxpose.fields.pin import pin as pin
 from jaxpose.fields.posenet import PoseNetConfig as PoseNetConfig
 from jaxpose.fields.posenet import posenet as posenet
 from jaxpose.fields.posenet import set_progress as set_progress

@@ -28,8 +28,20 @@ class Gauge(NamedTuple):
 Motion = Callable[[Params, Gauge], PoseFn]
 
 
-def make_field(name: FrameName, config: PoseNetConfig, interval_s: float, duration_s: float):
-    """The field, and its motion since the last frame, for a frame of reference of table 9.
+class Framed(NamedTuple):
+    """A field in a frame of reference.
+
+    `motion` is the body's since the last frame. `direct` is the same without the anchor: equal to it where the
+    field is the identity at the last frame, and without the anchor's freedom of gauge.
+    """
+
+    field: PoseField
+    motion: Motion
+    direct: Motion
+
+
+def make_field(name: FrameName, config: PoseNetConfig, interval_s: float, duration_s: float) -> Framed:
+    """The field for a frame of reference of table 9.
 
     `anchored` is ours: P(f(0))^-1 . P(f(t)), the identity at the last frame by construction, on a clock that
     starts there and spans a few intervals, so that how fast the field can turn does not depend on the length
@@ -42,7 +54,7 @@ def make_field(name: FrameName, config: PoseNetConfig, interval_s: float, durati
             zero = jnp.zeros(())
             return anchored(lambda t: field.pose(params, t), zero, gauge.T_ref_field)
 
-        return field, motion
+        return Framed(field, motion, lambda params, gauge: lambda t: field.pose(params, t))
 
     net = posenet(replace(config, span=(0.0, duration_s)))
     field = intrinsic(net, net) if name == "intrinsic" else net
@@ -50,7 +62,7 @@ def make_field(name: FrameName, config: PoseNetConfig, interval_s: float, durati
     def motion_in_frame(params, gauge):
         return in_frame(lambda t: field.pose(params, t + gauge.clock), gauge.T_ref_field)
 
-    return field, motion_in_frame
+    return Framed(field, motion_in_frame, motion_in_frame)
 
 
 def gauge(

@@ -20,11 +20,18 @@ from jaxpose.scenes import GridConfig, SceneField, box, grid, grow, merge
 from jaxpose.slam.frames import FrameName, gauge, make_field
 from jaxpose.slam.keyframes import Keyframe, choose, overlap
 from jaxpose.slam.mapping import MapConfig, MapState, make_descend, make_fuse
+from jaxpose.slam.objective import ImuWeights, TrackConfig
 from jaxpose.slam.observe import Image
 from jaxpose.slam.predict import (
-    BEHIND, Interval, Readings, end_velocity, integrate, no_readings, predict,
+    BEHIND,
+    Interval,
+    Readings,
+    end_velocity,
+    integrate,
+    no_readings,
+    predict,
 )  # fmt: skip
-from jaxpose.slam.track import ImuWeights, TrackConfig, Tracked, make_track
+from jaxpose.slam.track import Tracked, make_track
 
 ImuMode = Literal["none", "loose", "tight", "accelerometer", "combined"]
 
@@ -116,9 +123,9 @@ def run(
     T_body_cam = np.asarray(recording.T_body_cam, np.float64)
     T_cam_body = np.linalg.inv(T_body_cam)
     t = recording.t
-    field, motion = make_field(config.frame, config.field, float(np.median(np.diff(t))), float(t[-1] - t[0]))
-    params = field.init(field_key)
-    compile_world = partial(_compile, recording, config, field, motion)
+    framed = make_field(config.frame, config.field, float(np.median(np.diff(t))), float(t[-1] - t[0]))
+    params = framed.field.init(field_key)
+    compile_world = partial(_compile, recording, config, framed)
 
     T_world_cam = [_first_pose(recording)]
     T_world_body = [T_world_cam[0] @ T_cam_body]
@@ -242,7 +249,7 @@ def _points(frame: Frame, recording: Recording, T_world_cam: np.ndarray, step: i
     return points @ T_world_cam[:3, :3].T + T_world_cam[:3, 3]
 
 
-def _compile(recording, config, field, motion, grid_config: GridConfig, state: MapState | None) -> _World:
+def _compile(recording, config, framed, grid_config: GridConfig, state: MapState | None) -> _World:
     """The map's compiled steps for a grid; a map that starts if there is no state yet."""
     scene = grid(grid_config)
     scale = dict(band=grid_config.truncation, width=grid_config.truncation / 8)
@@ -257,7 +264,7 @@ def _compile(recording, config, field, motion, grid_config: GridConfig, state: M
     weights = IMU_WEIGHTS[config.imu]
     sigmas = _sigmas(recording, config)
     T_body_cam = jnp.asarray(recording.T_body_cam, jnp.float32)
-    track = make_track(scene, field, motion, recording.camera, T_body_cam, track_config, weights, sigmas)
+    track = make_track(scene, framed, recording.camera, T_body_cam, track_config, weights, sigmas)
     state = init_map(scene.init(jax.random.key(0))) if state is None else state
     return _World(grid_config, scene, state, _merge(state.params), track, update)
 

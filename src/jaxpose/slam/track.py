@@ -1,55 +1,31 @@
-"""Tracking: the pose field optimised against one RGB-D frame and the inertial readings since the last one.
+"""Tracking: the pose field brought to one RGB-D frame and the inertial readings since the last one.
 
 The whole inner loop is one compiled call. Times are seconds since the last frame and poses are motions of the
 body since then, `T_ref_body` with ref = the body at the last frame, so that nothing recompiles and float32 is
-enough however long the recording. What the field's own output refers to (the paper's table 9) is a composition
-on top, `Frame`.
+enough however long the recording. What the field's own output refers to (the paper's table 9) and which clock
+it reads are compositions on top, `slam/frames.py`.
 """
 
-from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int
 
-from jaxpose import imu as inertial
 from jaxpose import se3
 from jaxpose.camera import Camera
-from jaxpose.fields import Params, PoseField, PoseFn, fit
+from jaxpose.fields import Params, pin
 from jaxpose.imu import ResidualSigmas
-from jaxpose.losses import weighted_mean
 from jaxpose.scenes import SceneField
-from jaxpose.slam.frames import Motion
-from jaxpose.slam.observe import Image, Pixels, SampleConfig, depth_sigma, render_pixels, sample_pixels
-from jaxpose.slam.predict import Interval
+from jaxpose.slam.align import align
+from jaxpose.slam.frames import Framed
+from jaxpose.slam.objective import ImuWeights, TrackConfig, image_loss, image_residuals, imu_loss
+from jaxpose.slam.observe import sample_pixels
+from jaxpose.slam.predict import AHEAD
 
-
-@dataclass(frozen=True)
-class TrackConfig:
-    """How one frame is tracked."""
-
-    pixels: int = 400  # drawn anew in every iteration
-    edge: int = 8  # [px] border left out
-    iterations: int = 40  # at most
-    patience: int = 8  # iterations without a lower loss after which to stop
-    learning_rate: float = 1e-3  # Adam, of TransNet [per translation_scale]
-    rotation_rate: float = 2e-4  # of RotsNet
-    decay: float = 0.1  # of both rates over `iterations`
-    start_steps: int = 30  # of fitting the field to the predicted motion
-    colour_weight: float = 0.2  # of the colour residual against the depth residual, both in sigmas
-    minimum_valid: float = 0.2  # share of the pixels the map must explain
-    sample: SampleConfig = SampleConfig()
-
-
-class ImuWeights(NamedTuple):
-    """Weights of the three inertial losses (METHOD section 5, point 4); 0 leaves one out of the computation."""
-
-    loose: float = 0.0
-    tight: float = 0.0
-    accelerometer: float = 0.0
+_POSE_SIGMA = 2e-3  # [m, rad] what the field should keep to poses within
 
 
 class Tracked(NamedTuple):
@@ -57,70 +33,15 @@ class Tracked(NamedTuple):
 
     params: Params
     T_ref_body: Float[Array, "4 4"]
-    loss: Float[Array, ""]  # mean over the last iterations, in sigmas
+    loss: Float[Array, ""]  # of the image, in sigmas
     depth_error: Float[Array, ""]  # [m] median over valid pixels
     valid: Float[Array, ""]  # share of pixels with depth that the map explains
     iterations: Int[Array, ""]
 
 
-def render_loss(
-    query, T_world_cam: Float[Array, "4 4"], pixels: Pixels, far: Float[Array, ""], config: TrackConfig
-) -> tuple[Float[Array, ""], tuple[Float[Array, ""], Float[Array, ""]]]:
-    """Depth and colour residuals in sigmas (paper eq. 4); also the median depth error [m] and the valid share.
-
-    The depth's sigma is that of the rendered distribution and of the sensor; the colour's is the residuals' own
-    spread, so that colour that is badly registered to depth counts for less. Pixels off by ten times the median
-    are left out, as in NICE-SLAM.
-    """
-    seen = render_pixels(query, T_world_cam, pixels, far, config.sample)
-    has_depth = pixels.depth > 0
-    error = jnp.abs(seen.depth - pixels.depth)
-    sigma = jnp.sqrt(jax.lax.stop_gradient(seen.variance) + depth_sigma(pixels.depth) ** 2)
-    valid = has_depth & (seen.opacity > 0.5)
-    residual = error / sigma
-    inlier = valid & (residual < 10 * _median(residual, valid))
-    colour = jnp.mean(jnp.abs(seen.rgb - pixels.rgb), axis=-1)
-    spread = jnp.maximum(_median(colour, inlier), 0.01)
-    weight = jax.lax.stop_gradient(inlier.astype(error.dtype))
-    loss = weighted_mean(residual, weight) + config.colour_weight * weighted_mean(colour / spread, weight)
-    share = jnp.sum(valid) / jnp.maximum(jnp.sum(has_depth), 1)
-    return loss, (_median(error, valid), share)
-
-
-def imu_loss(
-    motion: PoseFn, interval: Interval, weights: ImuWeights, sigmas: ResidualSigmas
-) -> Float[Array, ""]:
-    """The weighted inertial L1 losses, each in units of its sigma, as means over readings and axes."""
-    mask = jnp.broadcast_to(interval.readings.mask[:, None], (interval.readings.mask.shape[0], 3)).astype(
-        jnp.float32
-    )
-    times = jnp.where(interval.readings.mask, interval.readings.imu.t, 0)
-    if weights.accelerometer:
-        residuals = inertial.imu_residuals(
-            motion,
-            times,
-            interval.readings.imu.omega_body,
-            interval.readings.acceleration_body,
-            interval.readings.R_ref_body,
-        )
-        terms = residuals._asdict()
-    else:
-        terms = {}
-        if weights.tight:
-            terms["tight"] = inertial.gyro_tight_residual(motion, times, interval.readings.imu.omega_body)
-        if weights.loose:
-            terms["loose"] = inertial.gyro_loose_residual(motion, times, interval.readings.R_ref_body)
-    total = jnp.zeros(())
-    for name, weight in weights._asdict().items():
-        if weight:
-            total = total + weight * weighted_mean(jnp.abs(terms[name]) / getattr(sigmas, name), mask)
-    return total
-
-
 def make_track(
     scene: SceneField,
-    field: PoseField,
-    motion: Motion,
+    framed: Framed,
     camera: Camera,
     T_body_cam: Float[Array, "4 4"],
     config: TrackConfig,
@@ -129,62 +50,94 @@ def make_track(
 ):
     """The compiled tracking step `track(scene_params, params, T_world_ref, gauge, interval, image, far, key)`.
 
-    First the field is fitted to the interval's predicted motion, then optimised on pixels drawn anew each
-    iteration until its loss no longer falls.
+    It returns `Tracked`. The field starts from its own parameters, brought to the interval's predicted motion.
     """
-    rates = {"translation": config.learning_rate, "rotation": config.rotation_rate}
+
+    motion = framed.motion
+
+    def bring(params, gauge, interval, T_ref_body, stamps):
+        """The field at the motion given at the stamps, and close to the inertial readings."""
+
+        def loss(params):
+            move = motion(params, gauge)
+            error = jax.vmap(move)(stamps) - T_ref_body
+            square = jnp.sum(error[:, :3] ** 2, axis=(-2, -1)) / _POSE_SIGMA**2
+            # Square near zero, so that Adam settles; else by size.
+            return jnp.mean(jnp.sqrt(1 + square)) + imu_loss(move, interval, weights, sigmas)
+
+        objective = lambda params, i: (loss(params), jnp.zeros(0))
+        (params, _), _ = _descend(objective, params, config, config.field_steps, config.field_steps)
+        return params
+
+    def gauss_newton(scene_params, params, T_world_ref, gauge, interval, image, far, key):
+        pixels = sample_pixels(key, image, camera, config.pixels, edge=config.edge)
+        start = se3.compose(T_world_ref, se3.compose(interval.T_ref_body[AHEAD - 1], T_body_cam))
+        found = align(partial(scene.query, scene_params), start, pixels, far, config)
+        T_world_body = se3.compose(found.T_world_cam, se3.inverse(T_body_cam))
+        T_ref_body = se3.compose(se3.inverse(T_world_ref), T_world_body)
+        # The motion found at this frame, and that of the frames before.
+        stamps, poses = interval.stamps[AHEAD - 1 :], interval.T_ref_body[AHEAD - 1 :].at[0].set(T_ref_body)
+        if any(weights):
+            params = bring(params, gauge, interval, poses, stamps)
+        params = pin(lambda p: jax.vmap(framed.direct(p, gauge))(stamps), params, poses)
+        return Tracked(
+            params,
+            motion(params, gauge)(interval.t),
+            found.loss,
+            found.residuals.depth_error,
+            found.residuals.valid,
+            found.iterations,
+        )
+
+    def gradient(scene_params, params, T_world_ref, gauge, interval, image, far, key):
+        params = bring(params, gauge, interval, interval.T_ref_body, interval.stamps)
+        query = partial(scene.query, scene_params)
+
+        def loss(params, i):
+            move = motion(params, gauge)
+            pixels = sample_pixels(jax.random.fold_in(key, i), image, camera, config.pixels, edge=config.edge)
+            T_world_cam = se3.compose(T_world_ref, se3.compose(move(interval.t), T_body_cam))
+            found = image_residuals(query, T_world_cam, pixels, far, config)
+            total = image_loss(found, config)
+            seen = jnp.stack([total, found.depth_error, found.valid])
+            return total + imu_loss(move, interval, weights, sigmas), seen
+
+        (params, seen), i = _descend(loss, params, config, config.iterations, config.patience)
+        return Tracked(params, motion(params, gauge)(interval.t), *seen, i)
+
+    return jax.jit(gauss_newton if config.method == "gauss_newton" else gradient)
+
+
+def _descend(objective, params, config: TrackConfig, iterations: int, patience: int):
+    """Adam on `objective(params, i) -> (loss, seen)` until it no longer falls for `patience` iterations.
+
+    Returns the parameters with running means of `seen`, and the iterations used. The loss is judged by running
+    means too: pixels differ from one iteration to the next.
+    """
+    rates = _rates(params, {"translation": config.learning_rate, "rotation": config.rotation_rate})
     adam = optax.scale_by_adam()
 
-    def loss_fn(params, scene_params, T_world_ref, gauge, interval, image, far, key):
-        move = motion(params, gauge)
-        pixels = sample_pixels(key, image, camera, config.pixels, edge=config.edge)
-        T_world_cam = se3.compose(T_world_ref, se3.compose(move(interval.t), T_body_cam))
-        loss, (error, share) = render_loss(
-            partial(scene.query, scene_params), T_world_cam, pixels, far, config
-        )
-        if any(weights):
-            loss = loss + imu_loss(move, interval, weights, sigmas)
-        return loss, (error, share)
+    def improve(carry):
+        params, state, mean, seen, best, best_at, i = carry
+        (loss, now), gradient = jax.value_and_grad(objective, has_aux=True)(params, i)
+        with jax.numpy_dtype_promotion("standard"):  # optax needs it
+            direction, state = adam.update(gradient, state)
+        fall = config.decay ** (i.astype(jnp.float32) / iterations)
+        params = jax.tree.map(lambda p, rate, d: p - rate * fall * d, params, rates, direction)
+        keep = jnp.where(i == 0, 0.0, 0.8)
+        mean, seen = keep * mean + (1 - keep) * loss, keep * seen + (1 - keep) * now
+        lower = mean < best * (1 - 1e-3)
+        best, best_at = jnp.where(lower, mean, best), jnp.where(lower, i, best_at)
+        return params, state, mean, seen, best, best_at, i + 1
 
-    @jax.jit
-    def track(scene_params, params, T_world_ref, gauge, interval, image, far, key) -> Tracked:
-        rate_tree = _rates(params, rates)
-        moving = PoseField(field.init, lambda p, t: motion(p, gauge)(t))
-        params = fit(
-            moving, interval.stamps, interval.T_ref_body, params=params, steps=config.start_steps,
-            learning_rate=rate_tree, decay=0.1,
-        ).params  # fmt: skip
+    def unsettled(carry):
+        *_, best_at, i = carry
+        return (i < iterations) & (i - best_at <= patience)
 
-        def improve(carry):
-            params, state, loss, error, share, best, best_at, i = carry
-            grad_fn = jax.value_and_grad(loss_fn, has_aux=True)
-            (now, (error_now, share_now)), gradient = grad_fn(
-                params, scene_params, T_world_ref, gauge, interval, image, far, jax.random.fold_in(key, i)
-            )
-            with jax.numpy_dtype_promotion("standard"):
-                direction, state = adam.update(gradient, state)
-            fall = config.decay ** (i.astype(jnp.float32) / config.iterations)
-            params = jax.tree.map(lambda p, r, d: p - r * fall * d, params, rate_tree, direction)
-            # Pixels differ from one iteration to the next: judge by running means.
-            keep = jnp.where(i == 0, 0.0, 0.8)
-            loss, error, share = (
-                keep * old + (1 - keep) * new
-                for old, new in ((loss, now), (error, error_now), (share, share_now))
-            )
-            lower = loss < best * (1 - 1e-3)
-            best, best_at = jnp.where(lower, loss, best), jnp.where(lower, i, best_at)
-            return params, state, loss, error, share, best, best_at, i + 1
-
-        def unsettled(carry):
-            *_, best_at, i = carry
-            return (i < config.iterations) & (i - best_at <= config.patience)
-
-        zero = jnp.zeros(())
-        start = (params, adam.init(params), zero, zero, zero, jnp.inf, jnp.int32(0), jnp.int32(0))
-        params, _, loss, error, share, *_, i = jax.lax.while_loop(unsettled, improve, start)
-        return Tracked(params, motion(params, gauge)(interval.t), loss, error, share, i)
-
-    return track
+    zero = jnp.zeros(jax.eval_shape(objective, params, jnp.int32(0))[1].shape)
+    start = (params, adam.init(params), jnp.zeros(()), zero, jnp.inf, jnp.int32(0), jnp.int32(0))
+    params, _, _, seen, *_, i = jax.lax.while_loop(unsettled, improve, start)
+    return (params, seen), i
 
 
 def _rates(params, rates):
@@ -196,10 +149,3 @@ def _rates(params, rates):
         return jnp.asarray(found[0] if found else rates["translation"], leaf.dtype)
 
     return jax.tree_util.tree_map_with_path(rate, params)
-
-
-def _median(x: Float[Array, " n"], mask: Bool[Array, " n"]) -> Float[Array, ""]:
-    """Median over the masked entries, without gradient; 0 when there are none."""
-    ordered = jnp.sort(jnp.where(mask, jax.lax.stop_gradient(x), jnp.inf))
-    middle = ordered[jnp.maximum(jnp.sum(mask) - 1, 0) // 2]
-    return jnp.where(jnp.any(mask), middle, 0.0)
