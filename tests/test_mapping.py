@@ -1,0 +1,131 @@
+"""Mapping a wall: fused against closed form and numpy, the gradient's map against the fused one."""
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.testing import assert_allclose, assert_array_equal
+
+from jaxpose.camera import Camera
+from jaxpose.scenes import GridConfig, grid, merge, node_positions
+from jaxpose.slam.mapping import MapConfig, make_descend, make_fuse
+from jaxpose.slam.observe import Image, SampleConfig
+
+CAMERA = Camera(60.0, 60.0, 31.5, 23.5, 64, 48)
+BAND = 0.15
+CONFIG = GridConfig((-0.4, -0.4, 1.2), (0.4, 0.4, 2.4), voxel=0.05, levels=1, truncation=BAND)
+WALL_Z = 1.83  # between nodes
+SHIFTS = np.array([[0.0, 0, 0], [0.2, -0.1, 0.15], [-0.25, 0.1, -0.1], [0.1, 0.2, 0.3]])
+
+
+def wall_image(shift, *, error=0.0, grey=100):
+    """A wall across the optical axis, seen by a camera moved but not turned."""
+    depth = np.full((48, 64), WALL_Z - shift[2] + error, np.float32)
+    return Image(jnp.full((48, 64, 3), grey, jnp.uint8), jnp.asarray(depth))
+
+
+def pose(shift):
+    T = np.eye(4, dtype=np.float32)
+    T[:3, 3] = shift
+    return jnp.asarray(T)
+
+
+def seen_by_all(shifts, margin=1):
+    """Nodes that project well within every image, at float64."""
+    inside = True
+    for shift in shifts:
+        x, y, z = np.moveaxis(node_positions(CONFIG).astype(np.float64) - shift, -1, 0)
+        u, v = 60 * x / z + 31.5, 60 * y / z + 23.5
+        inside &= (u > margin) & (u < 63 - margin) & (v > margin) & (v < 47 - margin)
+    return inside
+
+
+def fuse(images, shifts):
+    init, update = make_fuse(CONFIG, CAMERA, BAND)
+    state = init(grid(CONFIG).init(jax.random.key(0)))
+    for image, shift in zip(images, shifts, strict=True):
+        state = update(state, image, pose(shift))
+    return state
+
+
+def test_a_wall_seen_from_several_places_is_exact():
+    state = fuse([wall_image(s) for s in SHIFTS], SHIFTS)
+    distance = WALL_Z - node_positions(CONFIG)[..., 2].astype(np.float64)
+    known = seen_by_all(SHIFTS) & (distance > -BAND + 1e-4)
+    assert known.sum() > 1000
+    values = np.asarray(state.params[0])
+    assert_allclose(values[known, 0], np.minimum(distance, BAND)[known], atol=2e-6)
+    surface = known & (np.abs(distance) < BAND - 1e-4)
+    assert_allclose(values[surface, 1:], 100 / 255, atol=1e-6)
+    # What lies behind it was not seen.
+    assert_allclose(values[distance < -BAND - 1e-4, 0], BAND, rtol=1e-6)
+    assert_array_equal(np.asarray(state.memory)[distance < -BAND - 1e-4], 0)
+
+
+def test_two_observations_are_weighted_as_numpy_does():
+    """Inverse variances of the published sigma, at the depths that were measured."""
+    shifts, errors, greys = SHIFTS[[0, 3]], (0.03, -0.02), (50, 200)
+    images = [wall_image(s, error=e, grey=g) for s, e, g in zip(shifts, errors, greys, strict=True)]
+    values = np.asarray(fuse(images, shifts).params[0])
+    depths = [WALL_Z - s[2] + e for s, e in zip(shifts, errors, strict=True)]
+    weights = [(0.0012 + 0.0019 * (d - 0.4) ** 2) ** -2 for d in depths]
+    distance = WALL_Z - node_positions(CONFIG)[..., 2].astype(np.float64)
+    near = seen_by_all(shifts) & (np.abs(distance) < 0.1)
+    assert near.sum() > 200
+    assert_allclose(values[near, 0], distance[near] + np.average(errors, weights=weights), atol=3e-6)
+    assert_allclose(values[near, 1], np.average(greys, weights=weights) / 255, atol=3e-6)
+
+
+def test_pixels_without_depth_change_nothing():
+    init, update = make_fuse(CONFIG, CAMERA, BAND)
+    blind = wall_image(SHIFTS[0])._replace(depth=jnp.zeros((48, 64)))
+    before = init(grid(CONFIG).init(jax.random.key(0)))
+    after = update(jax.tree.map(jnp.copy, before), blind, pose(SHIFTS[0]))
+    jax.tree.map(assert_array_equal, after, before)
+
+
+def test_half_an_image_maps_half_the_wall():
+    image = wall_image(SHIFTS[0])
+    image = image._replace(depth=image.depth.at[:, :32].set(0))
+    state = fuse([image], SHIFTS[:1])
+    x = node_positions(CONFIG)[..., 0]
+    assert not np.any(np.asarray(state.memory)[x < -0.02])
+    assert np.any(np.asarray(state.memory)[x > 0.02])
+
+
+def test_frames_do_not_recompile():
+    init, update = make_fuse(CONFIG, CAMERA, BAND)
+    state = init(grid(CONFIG).init(jax.random.key(0)))
+    for shift in SHIFTS:
+        state = update(state, wall_image(shift), pose(shift))
+    assert update._cache_size() == 1
+
+
+def test_the_gradient_finds_the_same_wall_and_compiles_once():
+    config = GridConfig((-0.4, -0.4, 1.2), (0.4, 0.4, 2.4), voxel=0.05, levels=2, truncation=BAND)
+    scene = grid(config)
+    traces = chex.assert_max_traces(scene.query, n=1)
+    scene = scene._replace(query=traces)
+    settings = MapConfig(
+        method="gradient", pixels=500, window=4, sample=SampleConfig(front=6, surface=12, behind=0, band=BAND)
+    )
+    init, update = make_descend(scene, CAMERA, settings)
+    state = init(scene.init(jax.random.key(0)))
+    images = jax.tree.map(lambda *x: jnp.stack(x), *[wall_image(s) for s in SHIFTS])
+    poses = jnp.stack([pose(s) for s in SHIFTS])
+    losses = []
+    for i, (rate, iterations) in enumerate(((1e-2, 60), (2e-3, 60), (5e-4, 40))):
+        key = jax.random.fold_in(jax.random.key(1), i)
+        state, loss = update(
+            state, images, poses, jnp.float32(3), jnp.float32(rate), jnp.int32(iterations), key
+        )
+        losses.append(float(loss))
+    assert losses[-1] < losses[0]
+    distance = WALL_Z - node_positions(config)[..., 2].astype(np.float64)
+    near = seen_by_all(SHIFTS, margin=8) & (np.abs(distance) < 0.05)
+    assert near.sum() > 100
+    found = np.asarray(merge(state.params)[0])[near]
+    fused = np.asarray(fuse([wall_image(s) for s in SHIFTS], SHIFTS).params[0])[near]
+    assert np.median(np.abs(found[:, 0] - fused[:, 0])) < 2e-3
+    assert np.abs(found[:, 0] - fused[:, 0]).max() < 1e-2
+    assert_allclose(np.median(found[:, 1]), 100 / 255, atol=0.03)
