@@ -57,10 +57,11 @@ def grid(config: GridConfig) -> SceneField:
         position = (point - lower.astype(point.dtype)) / config.voxel  # in cells of the finest level
         steps = [RATIO ** (config.levels - 1 - level) for level in range(config.levels)]
         # A merged scene has one level, the finest.
-        value = sum(
+        first, *rest = (
             _trilinear(level, position / step)
             for level, step in zip(params, steps[-len(params) :], strict=True)
         )
+        value = sum(rest, first)
         return value[0], value[1:]
 
     return SceneField(init, query)
