@@ -1,0 +1,53 @@
+"""What every experiment's command does: options to a config, known errors to one line, the report."""
+
+import io
+import re
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import redirect_stderr
+from typing import TypeVar
+
+import tyro
+
+from jaxpose.errors import DataError
+
+Config = TypeVar("Config")
+
+
+def parse(
+    name: str, config_type: Callable[..., Config], description: str | None, args: Sequence[str] | None = None
+) -> Config:
+    """The config that the command line asks for; exits with one line and code 1 if it asks for what is not.
+
+    `--help` prints and exits with 0, as usual.
+    """
+    complaint = io.StringIO()
+    try:
+        with redirect_stderr(complaint):
+            return tyro.cli(
+                config_type, prog=f"python -m jaxpose.experiments.{name}", description=description, args=args
+            )
+    except SystemExit as stop:
+        if not stop.code:
+            raise
+        sys.exit(f"{name}: {_one_line(complaint.getvalue())}")
+    except ValueError as error:  # a config that does not allow its values
+        sys.exit(f"{name}: {error}")
+
+
+def guarded(name: str, action: Callable[[], str]) -> None:
+    """Print what `action` returns; what the user can mend ends in one line on stderr and code 1."""
+    try:
+        print(action())
+    except (DataError, OSError) as error:
+        sys.exit(f"{name}: {' '.join(str(error).split())}")
+    except KeyboardInterrupt:
+        sys.exit(f"{name}: interrupted, nothing written")
+
+
+def _one_line(boxed: str) -> str:
+    """Tyro's message without its frame, its title and what it says about --help."""
+    lines = [re.sub(r"[─│╭╮╰╯-]{3,}|[│╭╮╰╯]", " ", line).strip() for line in boxed.splitlines()]
+    lines = [line for line in lines if line][1:]
+    ends = [k for k, line in enumerate(lines) if line.startswith(("For full helptext", "Argument helptext"))]
+    return " ".join(" ".join(lines[: ends[0]] if ends else lines).split())

@@ -1,0 +1,173 @@
+"""What is measured on a tracked recording: cost, errors, the map, the field's own derivatives."""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxpose import metrics
+from jaxpose.errors import DataError
+from jaxpose.fields import body_to_camera
+from jaxpose.imu import Imu, remove_gravity
+from jaxpose.motion import motion
+from jaxpose.plots import View
+from jaxpose.recording import Recording
+from jaxpose.slam.observe import Image, Pixels, SampleConfig, read_pixels, render_pixels
+from jaxpose.slam.run import SlamResult
+
+_VIEW_WIDTH = 160  # [px] of rendered pictures, about
+_VIEWS = 4
+_CHUNK = 4800  # rays rendered in one call
+_MOST_READINGS = 4000  # compared with the field; more are thinned
+
+
+class Inertial(NamedTuple):
+    """IMU and field at the same times, in body axes: (read, field) of both sensors, and RMS differences."""
+
+    t: Float[np.ndarray, " s"]
+    gyro: tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]]  # rad/s
+    accelerometer: tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]]  # m/s^2, free of gravity
+    gyro_rms: float
+    accelerometer_rms: float
+
+
+class Accuracy(NamedTuple):
+    """Errors against the truth after SE(3) alignment, frame by frame and as numbers for the results."""
+
+    aligned: Float[np.ndarray, "n 4 4"]
+    translation_m: Float[np.ndarray, " n"]
+    rotation_deg: Float[np.ndarray, " n"]
+    numbers: dict[str, Any]
+
+
+def cost(result: SlamResult) -> dict[str, Any]:
+    """What tracking cost and how it went."""
+    settled = result.seconds[2:]  # the first two compile
+    return {
+        "frames": len(result.lost),
+        "frames_lost": int(result.lost.sum()),
+        "lost": np.flatnonzero(result.lost),
+        "seconds_per_frame": float(np.median(settled)),
+        "seconds_per_frame_mean_with_compilation": float(result.seconds.mean()),
+        "iterations_mean": float(result.iterations[1:].mean()),
+        "depth_error_median_m": metrics.statistics(result.depth_error).median,
+        "keyframes": [keyframe.index for keyframe in result.keyframes],
+        "field_rmse_m": result.field_rmse_m,
+        "field_rmse_deg": result.field_rmse_deg,
+    }
+
+
+def accuracy(
+    result: SlamResult, t: Float[np.ndarray, " n"], T_world_true: Float[np.ndarray, "n 4 4"]
+) -> Accuracy:
+    """The usual trajectory errors of the tracked poses, and of the final field read at the frames' times."""
+    ate = metrics.ate(result.T_world_cam, T_world_true)
+    aligned = metrics.align(ate.alignment, result.T_world_cam)
+    rotation_deg = metrics.rotation_angle_deg(aligned[:, :3, :3], T_world_true[:, :3, :3])
+    field = jax.jit(jax.vmap(partial(result.field.pose, result.field_params)))
+    field_poses = np.asarray(field(jnp.asarray(t, jnp.float32)), np.float64)
+    numbers = {
+        "alignment": "se3",
+        "ate_rmse_m": ate.rmse,
+        "ate_max_m": ate.max,
+        "rotation_rmse_deg": metrics.statistics(rotation_deg).rmse,
+        "frames_with_truth": ate.frames,
+        "rpe": _drift(result.T_world_cam, T_world_true),
+        "field_ate_rmse_m": metrics.ate(field_poses, T_world_true).rmse,
+    }
+    return Accuracy(aligned, ate.errors, rotation_deg, numbers)
+
+
+def _drift(T_world_cam: Float[np.ndarray, "n 4 4"], T_world_true: Float[np.ndarray, "n 4 4"]):
+    try:
+        rpe = metrics.rpe(T_world_cam, T_world_true)
+    except DataError:  # no two frames in a row have a truth
+        return None
+    return {
+        "delta_frames": 1,
+        "translation_rmse_m": rpe.translation_m.rmse,
+        "rotation_rmse_deg": rpe.rotation_deg.rmse,
+        "pairs": rpe.pairs,
+    }
+
+
+def inertial(recording: Recording, result: SlamResult) -> Inertial | None:
+    """The field's own body rate and acceleration beside what the IMU read; None without an IMU."""
+    imu = recording.imu
+    if imu is None:
+        return None
+    t, read_omega, read_force = (np.asarray(x) for x in imu)
+    inside = np.flatnonzero((t >= recording.t[0]) & (t <= recording.t[-1]))
+    if len(inside) == 0:
+        return None
+    chosen = inside[:: -(-len(inside) // _MOST_READINGS)]
+    t, read_omega, read_force = t[chosen], read_omega[chosen], read_force[chosen]
+    T_cam_body = jnp.asarray(np.linalg.inv(recording.T_body_cam), jnp.float32)
+    gravity_world = jnp.asarray(recording.gravity_world, jnp.float32)
+
+    @jax.jit
+    def derivatives(params, imu):
+        body = body_to_camera(partial(result.field.pose, params), T_cam_body)  # here from camera to body
+        at = jax.vmap(partial(motion, body))(imu.t)
+        R_world_body = at.pose[:, :3, :3]
+        field = jnp.einsum("nji,nj->ni", R_world_body, at.acceleration_world, precision="highest")
+        return at.omega_body, remove_gravity(imu, R_world_body, gravity_world), field
+
+    readings = Imu(*(jnp.asarray(x, jnp.float32) for x in (t, read_omega, read_force)))
+    omega, read, field = (np.asarray(x, np.float64) for x in derivatives(result.field_params, readings))
+    gyro, accelerometer = (read_omega, omega), (read, field)
+    rms = [float(np.sqrt(np.mean((a - b) ** 2))) for a, b in (gyro, accelerometer)]
+    return Inertial(t, gyro, accelerometer, *rms)
+
+
+def views(recording: Recording, result: SlamResult) -> list[View]:
+    """A few frames, evenly over the recording, beside the map rendered from their estimated poses.
+
+    The measured depth plays no part in the rendering: a first pass over evenly spaced samples finds the
+    surface, a second one looks closely.
+    """
+    grid, camera = result.grid, recording.camera
+    step = max(1, round(camera.width / _VIEW_WIDTH))
+    row, column = np.mgrid[step // 2 : camera.height : step, step // 2 : camera.width : step]
+    fine = SampleConfig(band=grid.truncation, width=grid.truncation / 8)
+    reach = float(np.linalg.norm(np.subtract(grid.upper, grid.lower)))
+    evenly = int(np.clip(reach / grid.truncation * 4, 64, 256))
+    coarse = SampleConfig(front=evenly, surface=0, behind=0, band=grid.truncation, width=grid.truncation / 4)
+
+    @jax.jit
+    def render(params, T_world_cam: Float[Array, "4 4"], pixels: Pixels):
+        query, far = partial(result.scene.query, params), jnp.float32(reach)
+        unknown = pixels._replace(depth=jnp.zeros_like(pixels.depth))
+        found = render_pixels(query, T_world_cam, unknown, far, coarse)
+        surface = jnp.where(found.opacity > 0.5, found.depth, 0)
+        seen = render_pixels(query, T_world_cam, pixels._replace(depth=surface), far, fine)
+        there = (surface > 0) & (seen.opacity > 0.5)
+        return jnp.where(there[:, None], seen.rgb, 0.86), jnp.where(there, seen.depth, 0)
+
+    def view(i: int) -> View:
+        frame = recording.read(i)
+        image = Image(jnp.asarray(frame.rgb), jnp.asarray(frame.depth, jnp.float32))
+        pose = jnp.asarray(result.T_world_cam[i], jnp.float32)
+        count = row.size
+        padded = (
+            np.arange(-(-count // _CHUNK) * _CHUNK) % count
+        )  # whole chunks, so that one shape is compiled
+        parts = []
+        for chunk in padded.reshape(-1, _CHUNK):
+            pixels = read_pixels(image, camera, jnp.asarray(row.flat[chunk]), jnp.asarray(column.flat[chunk]))
+            parts.append(jax.device_get(render(result.scene_params, pose, pixels)))
+        rgb, depth = (np.concatenate(x)[:count] for x in zip(*parts, strict=True))
+        lost = ", lost" if result.lost[i] else ""
+        return View(
+            f"t = {recording.t[i]:.2f} s{lost}",
+            np.asarray(frame.rgb),
+            rgb.reshape(*row.shape, 3),
+            np.asarray(frame.depth)[row, column],
+            depth.reshape(row.shape),
+        )
+
+    count = len(recording.t)
+    return [view(i) for i in sorted({round(i) for i in np.linspace(0, count - 1, min(_VIEWS, count))})]

@@ -1,0 +1,182 @@
+"""Options that the SLAM experiments share, and the recording they name."""
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple
+
+import jax
+import numpy as np
+import tyro
+
+from jaxpose.data import sevenscenes
+from jaxpose.data.synthetic import RoomConfig, room
+from jaxpose.errors import DataError
+from jaxpose.imu import ADIS16448, QUIET, Imu, ImuNoise
+from jaxpose.imu_simulation import simulate_from_poses
+from jaxpose.recording import Recording, select, thin
+from jaxpose.slam.run import SlamConfig
+
+SIMULATED_HZ = 200.0  # of the IMU made for recordings that have none (METHOD section 5)
+SMOKE_FRAMES = 8
+FEWEST_FRAMES = 3  # three camera centres are the fewest that an alignment can be wrong about
+
+
+@dataclass(frozen=True)
+class Options:
+    """Settings of a run; a recording and these are all that a result depends on."""
+
+    data: Path | None = None  # folder of a recording; without one a synthetic room is made on the fly
+    format: Literal["sevenscenes", "room"] | None = None  # None: sevenscenes with --data, room without
+    recorded_hz: float = 30.0  # frame rate of a sevenscenes recording, which has no time stamps
+    rate_hz: float | None = None  # frames are thinned to this; None: the room's, or all frames
+    start: int = 0  # first frame used, counted before thinning
+    frames: int | None = None  # how many frames from there, counted before thinning; None: all
+    # How rotations pass through the true poses where an IMU is simulated from them: slerp is the paper's.
+    imu_rotation: Literal["slerp", "spline"] = "slerp"
+    compare: bool = False  # run all IMU modes and put them side by side
+    smoke: bool = False  # everything shrunk to seconds; the numbers then mean nothing
+    out: Path | None = None  # exactly this folder; None: outputs/<experiment>/<name or time stamp>
+    name: str | None = None  # of the run folder
+    slam: Annotated[SlamConfig, tyro.conf.arg(name="")] = SlamConfig()
+    room: RoomConfig = RoomConfig()
+
+    def __post_init__(self):
+        for option in ("recorded_hz", "rate_hz"):
+            value = getattr(self, option)
+            if value is not None and not 0 < value < math.inf:
+                raise ValueError(f"--{option.replace('_', '-')}: expected a positive number, got {value}")
+        if self.start < 0:
+            raise ValueError(f"--start: expected 0 or more, got {self.start}")
+        if self.frames is not None and self.frames < FEWEST_FRAMES:
+            raise ValueError(f"--frames: expected at least {FEWEST_FRAMES}, got {self.frames}")
+        if self.slam.voxel is not None and not 0 < self.slam.voxel < math.inf:
+            raise ValueError(f"--voxel: expected a positive number, got {self.slam.voxel}")
+        if self.format == "sevenscenes" and self.data is None:
+            raise ValueError("--format sevenscenes: expected --data DIR with it")
+        if self.format == "room" and self.data is not None:
+            raise ValueError(f"--format room: expected no --data, as the room is made; got {self.data}")
+        _room_config(self)
+
+
+def slam_config(options: Options) -> SlamConfig:
+    """How to track; with `--smoke` a field that compiles sooner."""
+    if not options.smoke:
+        return options.slam
+    return replace(options.slam, field=replace(options.slam.field, layers=2, width=32))
+
+
+class Source(NamedTuple):
+    """A recording ready to be tracked, and where it comes from in words and numbers."""
+
+    recording: Recording
+    about: dict[str, Any]
+    imu: str  # where the inertial readings come from
+
+
+def load(options: Options) -> Source:
+    """The recording that the options name: loaded or made, given an IMU if one is needed, cut and thinned.
+
+    An IMU is simulated from the truth before frames are thinned. Time starts at the first frame used. Raises
+    DataError or OSError for what cannot be used.
+    """
+    if options.data is None:
+        recording = room(_room_config(options))
+        noise = options.room.imu_noise
+        imu = f"{options.room.imu_rate_hz:g} Hz, exact derivatives of the room's path, {_sheet(noise)}"
+    else:
+        recording = sevenscenes.load(options.data, rate_hz=options.recorded_hz)
+        imu = "none"
+        if options.compare or options.slam.imu != "none":
+            recording = recording._replace(imu=_simulated(recording, options))
+            imu = (
+                f"simulated at {SIMULATED_HZ:g} Hz from the truth before thinning (cubic spline positions, "
+                f"{options.imu_rotation} rotations, gravity along -z of the truth's frame), "
+                f"{_sheet(options.slam.imu_noise)}, seed {options.slam.seed}"
+            )
+    recorded = len(recording.t)
+    recording = _cut(recording, options)
+    about = {
+        "name": recording.name,
+        "format": "room" if options.data is None else "sevenscenes",
+        "path": options.data,
+        "frames_recorded": recorded,
+        "start": options.start,
+        "rate_hz": 1 / float(np.median(np.diff(recording.t))),
+        "size": (recording.camera.width, recording.camera.height),
+    }
+    return Source(recording, about, imu)
+
+
+def _room_config(options: Options) -> RoomConfig:
+    """The room's settings, frames at the rate asked for; ValueError for settings that do not go together."""
+    config = replace(options.room, rate_hz=options.rate_hz or options.room.rate_hz)
+    if not options.smoke:
+        return config
+    duration_s = min(config.duration_s, (SMOKE_FRAMES - 1) / config.rate_hz)
+    return replace(config, duration_s=duration_s, width=80, height=60)
+
+
+def _sheet(noise: ImuNoise) -> str:
+    """A data sheet in words."""
+    if noise == QUIET:
+        return "no noise"
+    return "ADIS16448's noise" if noise == ADIS16448 else f"noise {noise}"
+
+
+def _simulated(recording: Recording, options: Options) -> Imu:
+    """Readings of an IMU at the camera, from the true poses."""
+    truth = recording.T_world_cam
+    if truth is None or np.isfinite(truth).all(axis=(1, 2)).sum() < FEWEST_FRAMES:
+        mode = "--compare" if options.compare else f"--imu {options.slam.imu}"
+        raise DataError(
+            f"{recording.name}: {mode} expected true poses to simulate an IMU from, got none; "
+            "--imu none goes without"
+        )
+    return simulate_from_poses(
+        recording.t,
+        truth @ np.linalg.inv(recording.T_body_cam),
+        SIMULATED_HZ,
+        rotation=options.imu_rotation,
+        noise=options.slam.imu_noise,
+        key=jax.random.fold_in(jax.random.key(options.slam.seed), 200),
+        gravity_world=recording.gravity_world,
+    )
+
+
+def _cut(recording: Recording, options: Options) -> Recording:
+    """The frames asked for, thinned, on a clock that starts at the first of them."""
+    count = len(recording.t)
+    if options.start >= count:
+        raise DataError(
+            f"{recording.name}: expected --start below {count}, the frames it has, got {options.start}"
+        )
+    stop = count if options.frames is None else options.start + options.frames
+    if stop > count:
+        raise DataError(
+            f"{recording.name}: expected --frames of at most {count - options.start}, those from --start "
+            f"{options.start} on, got {options.frames}"
+        )
+    recording = select(recording, np.arange(options.start, stop))
+    if options.rate_hz is not None:
+        recording = thin(recording, options.rate_hz)
+    if options.smoke:
+        recording = select(recording, np.arange(min(len(recording.t), SMOKE_FRAMES)))
+    if len(recording.t) < FEWEST_FRAMES:
+        raise DataError(
+            f"{recording.name}: expected at least {FEWEST_FRAMES} frames to track, got {len(recording.t)} "
+            f"from frame {options.start} at {options.rate_hz or options.recorded_hz:g} Hz"
+        )
+    first, imu, truth = recording.t[0], recording.imu, recording.T_world_cam
+    notes = recording.notes
+    if truth is not None and np.isfinite(truth).all(axis=(1, 2)).sum() < FEWEST_FRAMES:
+        truth, notes = (
+            None,
+            (*notes, "too few true poses among the frames used: there is no truth to compare with"),
+        )
+    return recording._replace(
+        t=recording.t - first,
+        imu=None if imu is None else imu._replace(t=np.asarray(imu.t) - first),
+        T_world_cam=truth,
+        notes=notes,
+    )

@@ -1,0 +1,191 @@
+"""What the SLAM experiments do: run, measure, draw, and write the run folder."""
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple, get_args
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxpose import io, plots, se3
+from jaxpose.experiments.slam_measure import Accuracy, Inertial, accuracy, cost, inertial, views
+from jaxpose.experiments.slam_options import Options, Source, load, slam_config
+from jaxpose.experiments.slam_report import table
+from jaxpose.fields import Params, PoseField, PoseNetConfig, posenet
+from jaxpose.recording import Recording
+from jaxpose.slam.run import ImuMode, Progress, SlamResult
+from jaxpose.slam.run import run as track
+
+OnFrame = Callable[[ImuMode, Progress], None]
+
+
+class Outcome(NamedTuple):
+    """Where a run was written, and its results; with `compare` those of each IMU mode under `modes`."""
+
+    folder: Path
+    results: dict[str, Any]
+
+
+def run(experiment: str, options: Options, on_frame: OnFrame | None = None) -> Outcome:
+    """Track the recording that the options name and write the run folder.
+
+    With `compare` the folder holds one run folder for each IMU mode. Raises DataError or OSError for what
+    cannot be used; then no folder is left behind.
+    """
+    started = time.perf_counter()
+    source = load(options)
+    with _folder(experiment, options) as folder:
+        if options.compare:
+            return Outcome(folder, _compare(experiment, options, source, folder, on_frame, started))
+        results, _ = _single(experiment, options, source, folder, on_frame, started)
+        return Outcome(folder, results)
+
+
+@contextmanager
+def _folder(experiment: str, options: Options) -> Iterator[Path]:
+    """The run folder, tried for writing before hours are spent; taken away if the run leaves it empty."""
+    folder = io.run_folder(experiment, name=options.name, out=options.out)
+    probe = folder / ".writable"
+    probe.touch()
+    probe.unlink()
+    try:
+        yield folder
+    finally:
+        for inner in (*folder.glob("*/"), folder):
+            if not any(inner.iterdir()):
+                inner.rmdir()
+
+
+def _compare(
+    experiment: str, options: Options, source: Source, folder: Path, on_frame: OnFrame | None, started: float
+) -> dict[str, Any]:
+    """A run for each IMU mode, and all of them side by side."""
+    by_mode, errors = {}, {}
+    for mode in get_args(ImuMode):
+        single = replace(options, compare=False, slam=replace(options.slam, imu=mode))
+        (folder / mode).mkdir(exist_ok=True)
+        by_mode[mode], errors[mode] = _single(
+            experiment, single, source, folder / mode, on_frame, time.perf_counter()
+        )
+    results = {
+        "experiment": experiment,
+        "seed": options.slam.seed,
+        "modes": by_mode,
+        "wall_s": time.perf_counter() - started,
+        "peak_rss_bytes": io.peak_rss_bytes(),
+    }
+    recording = source.recording
+    if recording.T_world_cam is not None:
+        rate = f"{len(recording.t)} frames at {source.about['rate_hz']:.3g} Hz"
+        title = f"{recording.name}, {rate}: IMU modes, errors after SE(3) alignment"
+        plots.comparison(folder / "comparison.png", recording.t, errors, title)
+    io.write_json(folder / "config.json", options)
+    io.write_text(folder / "table.md", table(by_mode) + "\n")
+    io.write_json(folder / "results.json", results)
+    return results
+
+
+def _single(
+    experiment: str, options: Options, source: Source, folder: Path, on_frame: OnFrame | None, started: float
+) -> tuple[dict[str, Any], Float[np.ndarray, " n"]]:
+    """One tracked run, written: its results, and the translation error [m] of every frame."""
+    recording, mode, truth = source.recording, options.slam.imu, source.recording.T_world_cam
+    result = track(recording, slam_config(options), None if on_frame is None else partial(on_frame, mode))
+    errors = None if truth is None else accuracy(result, recording.t, truth)
+    motion = inertial(recording, result)
+    results = {
+        "experiment": experiment,
+        "data": source.about,
+        "imu": {"mode": mode, "readings": "not used" if mode == "none" else source.imu},
+        "frame_of_reference": options.slam.frame,
+        "seed": options.slam.seed,
+        "smoke": options.smoke,
+        **cost(result),
+    }
+    if errors is not None:
+        results |= errors.numbers
+    if motion is not None:
+        results |= {
+            "field_gyro_rms_rad_s": motion.gyro_rms,
+            "field_accelerometer_rms_m_s2": motion.accelerometer_rms,
+        }
+    _draw(folder, f"{recording.name}, IMU {mode}", recording, result, errors, motion)
+    io.write_tum(folder / "trajectory.txt", io.Trajectory(recording.t, result.T_world_cam))
+    if truth is not None:
+        io.write_tum(folder / "reference.txt", io.Trajectory(recording.t, truth))
+    _save_field(folder / "field.npz", options, recording, result)
+    io.write_json(folder / "config.json", options)
+    results |= {
+        "notes": recording.notes,
+        "versions": io.versions(),
+        "wall_s": time.perf_counter() - started,
+        "peak_rss_bytes": io.peak_rss_bytes(),
+    }
+    io.write_json(folder / "results.json", results)
+    return results, np.full(len(recording.t), np.nan) if errors is None else errors.translation_m
+
+
+def _draw(
+    folder: Path,
+    name: str,
+    recording: Recording,
+    result: SlamResult,
+    errors: Accuracy | None,
+    motion: Inertial | None,
+) -> None:
+    """The pictures of a run, poses aligned as their errors are."""
+    name = f"{name}, {len(recording.t)} frames"
+    if errors is None:
+        title = f"{name}: no truth to compare with"
+        plots.trajectory(folder / "trajectory.png", result.T_world_cam, None, result.lost, title)
+    else:
+        ate = f"{name}: ATE-RMSE {100 * errors.numbers['ate_rmse_m']:.2f} cm after SE(3) alignment"
+        plots.trajectory(folder / "trajectory.png", errors.aligned, recording.T_world_cam, result.lost, ate)
+        plots.errors(
+            folder / "errors.png", recording.t, errors.translation_m, errors.rotation_deg, result.lost, ate
+        )
+    plots.renders(
+        folder / "renders.png", views(recording, result), f"{name}: the map seen from the estimated poses"
+    )
+    if motion is not None:
+        title = f"{name}: IMU against the derivatives of the final field"
+        plots.inertial(folder / "inertial.png", motion.t, motion.gyro, motion.accelerometer, title)
+
+
+def _save_field(path: Path, options: Options, recording: Recording, result: SlamResult) -> None:
+    """The final field: weights by name, such as `translation/layer_0/kernel`, settings, first pose."""
+    leaves = jax.tree_util.tree_flatten_with_path(result.field_params)[0]
+    weights: dict[str, Any] = {"/".join(key.key for key in keys): np.asarray(leaf) for keys, leaf in leaves}
+    inputs = next(iter(result.field_params.values()))["layer_0"]["kernel"].shape[0]
+    config = replace(
+        slam_config(options).field,
+        span=(0.0, float(recording.t[-1])),
+        octaves=(inputs - 1) // 2,
+        head="free",
+        window=None,
+    )
+    with io.atomic(path) as temporary:
+        np.savez(temporary, T_world_first=result.T_world_cam[0], config=json.dumps(asdict(config)), **weights)
+
+
+def load_field(folder: Path | str) -> tuple[PoseField, Params]:
+    """The trajectory of a run folder as a field and its parameters: `field.pose(params, t)` is T_world_cam.
+
+    `t` is in seconds on the clock of `trajectory.txt`, anywhere between its first and last.
+    """
+    with np.load(Path(folder) / "field.npz") as file:
+        settings = json.loads(str(file["config"]))
+        T_world_first = jnp.asarray(file["T_world_first"], jnp.float32)
+        params: dict[str, Any] = {}
+        for name in set(file.files) - {"config", "T_world_first"}:
+            network, layer, kind = name.split("/")
+            params.setdefault(network, {}).setdefault(layer, {})[kind] = jnp.asarray(file[name])
+    net = posenet(PoseNetConfig(**settings | {"span": tuple(settings["span"])}))
+    return PoseField(net.init, lambda p, t: se3.compose(T_world_first, net.pose(p, t))), params
