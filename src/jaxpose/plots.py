@@ -127,7 +127,7 @@ def renders(path: Path | str, views: Sequence[View], title: str) -> None:
     row_height = 10.6 / 5 * height / width + 0.06
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=(11, 1.1 + len(views) * row_height), dpi=DPI, layout="constrained")
-        figure.get_layout_engine().set(w_pad=0.02, h_pad=0.02)  # type: ignore[union-attr]
+        figure.get_layout_engine().set(w_pad=0.02, h_pad=0.045)  # type: ignore[union-attr]
         cells = figure.add_gridspec(len(views) + 1, 5, height_ratios=[1] * len(views) + [0.05])
         depth_shade = error_shade = None
         for number, view in enumerate(views):
