@@ -12,6 +12,7 @@ from jaxpose.slam.objective import Residuals, TrackConfig, image_loss, image_res
 from jaxpose.slam.observe import Pixels
 
 _SETTLED = 2e-4  # [m, rad] a step this small ends the alignment
+_INDEPENDENT = 100.0  # pixels
 _LONGEST = 0.1  # [m, rad] no step is longer
 
 
@@ -27,9 +28,37 @@ class Alignment(NamedTuple):
     iterations: Int[Array, ""]
 
 
+def starts(T_ref_body: Float[Array, "4 4"], sigma: Float[Array, "2"]) -> Float[Array, "k 4 4"]:
+    """Motions to try at first: the predicted one, and some around it, `sigma` [m, rad] away along each axis."""
+    axes = jnp.concatenate([jnp.eye(6), -jnp.eye(6)]) * jnp.repeat(sigma, 3)[None]
+    return jnp.concatenate([T_ref_body[None], se3.compose(T_ref_body, se3.exp(axes))])
+
+
+def best_start(
+    query: Query,
+    T_world_cam: Float[Array, "k 4 4"],
+    pixels: Pixels,
+    far: Float[Array, ""],
+    config: TrackConfig,
+    *,
+    count: int = 150,
+) -> Float[Array, "4 4"]:
+    """The candidate pose that explains the first `count` pixels best; pixels it does not explain count as bad."""
+    few = jax.tree.map(lambda x: x[:count], pixels)
+
+    def score(T):
+        found = image_residuals(query, T, few, far, config)
+        worst = 20.0
+        return jnp.mean(jnp.where(found.inlier > 0, jnp.minimum(jnp.abs(found.depth), worst), worst))
+
+    return T_world_cam[jnp.argmin(jax.lax.map(score, T_world_cam))]
+
+
 def align(
     query: Query,
     T_world_cam: Float[Array, "4 4"],
+    T_world_predicted: Float[Array, "4 4"],
+    sigma: Float[Array, "2"],
     pixels: Pixels,
     far: Float[Array, ""],
     config: TrackConfig,
@@ -37,8 +66,10 @@ def align(
     """The pose that minimises the L1 image loss near a start, by reweighted Gauss-Newton steps.
 
     Six forward passes along the directions of the tangent space give the Jacobian. A step that makes the loss
-    worse is taken back and tried again with ten times the damping.
+    worse is taken back and tried again with ten times the damping. The predicted pose is a measurement too, with
+    `sigma` [m, rad]; against it the image counts as `_INDEPENDENT` pixels, since errors of a map go together.
     """
+    prior = jnp.repeat(sigma, 3) ** -2
 
     def linearised(T):
         at = lambda xi: _vectors(image_residuals(query, se3.compose(T, se3.exp(xi)), pixels, far, config))
@@ -54,16 +85,22 @@ def align(
         information += jnp.einsum("inc,jnc,nc->ij", d_colour, d_colour, w_colour, precision="highest")
         slope = jnp.einsum("in,n,n->i", d_depth, depth, w_depth, precision="highest")
         slope += jnp.einsum("inc,nc,nc->i", d_colour, colour, w_colour, precision="highest")
-        return information, slope, image_loss(found, config), found
+        away = se3.log(se3.compose(se3.inverse(T_world_predicted), T))
+        share = jnp.sum(found.inlier) / _INDEPENDENT
+        information += share * jnp.diag(prior)
+        slope += share * prior * away
+        loss = image_loss(found, config)
+        return information, slope, loss + jnp.sum(prior * away**2) / (2 * _INDEPENDENT), loss, found
 
     def improve(carry):
-        best, (T, *_), damping, _, i = carry
-        information, slope, loss, found = equations(T)
-        better = loss < best.loss
+        best, lowest, (T, last_slope), damping, _, i = carry
+        information, slope, total, loss, found = equations(T)
+        better = total < lowest
+        lowest = jnp.where(better, total, lowest)
         best = jax.tree.map(
             lambda new, old: jnp.where(better, new, old), Alignment(T, information, loss, found, i), best
         )
-        slope = jnp.where(better, slope, carry[1][1])
+        slope = jnp.where(better, slope, last_slope)
         damping = jnp.clip(jnp.where(better, damping / 10, damping * 10), 1e-4, 1e4)
         scaled = (
             best.information + (damping + 1e-6) * jnp.diag(jnp.diag(best.information)) + 1e-6 * jnp.eye(6)
@@ -71,7 +108,7 @@ def align(
         step = -jnp.linalg.solve(scaled, slope)
         length = jnp.linalg.norm(step)
         step = step * jnp.minimum(1, _LONGEST / jnp.maximum(length, 1e-12))
-        return best, (se3.compose(best.T_world_cam, se3.exp(step)), slope), damping, length, i + 1
+        return best, lowest, (se3.compose(best.T_world_cam, se3.exp(step)), slope), damping, length, i + 1
 
     def unsettled(carry):
         *_, length, i = carry
@@ -82,7 +119,7 @@ def align(
         jnp.zeros(count), jnp.zeros((count, 3)), jnp.zeros(count), jnp.zeros(()), jnp.zeros(())
     )
     start = Alignment(T_world_cam, jnp.zeros((6, 6)), jnp.inf, nothing, jnp.int32(0))
-    carry = (start, (T_world_cam, jnp.zeros(6)), jnp.float32(1e-2), jnp.inf, jnp.int32(0))
+    carry = (start, jnp.inf, (T_world_cam, jnp.zeros(6)), jnp.float32(1e-2), jnp.inf, jnp.int32(0))
     best, *_, i = jax.lax.while_loop(unsettled, improve, carry)
     return best._replace(iterations=i)
 

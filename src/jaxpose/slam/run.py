@@ -29,9 +29,11 @@ from jaxpose.slam.predict import (
     end_velocity,
     integrate,
     no_readings,
+    observe_acceleration,
     predict,
+    prediction_sigma,
 )  # fmt: skip
-from jaxpose.slam.track import Tracked, make_track
+from jaxpose.slam.track import Tracked, make_settle, make_track
 
 ImuMode = Literal["none", "loose", "tight", "accelerometer", "combined"]
 
@@ -42,6 +44,8 @@ IMU_WEIGHTS: dict[ImuMode, ImuWeights] = {
     "accelerometer": ImuWeights(accelerometer=1.0),
     "combined": ImuWeights(loose=1.0, tight=1.0, accelerometer=1.0),
 }
+
+_USES_SPEED = ("accelerometer", "combined")
 
 # How well a PoseNet over a few frames follows a hand's motion between them: added to the sensor's own noise.
 FIELD_SIGMAS = ResidualSigmas(loose=0.004, tight=0.1, accelerometer=1.0)
@@ -125,11 +129,12 @@ def run(
     t = recording.t
     framed = make_field(config.frame, config.field, float(np.median(np.diff(t))), float(t[-1] - t[0]))
     params = framed.field.init(field_key)
-    compile_world = partial(_compile, recording, config, framed)
+    settle = make_settle(framed, config.track, IMU_WEIGHTS[config.imu], _sigmas(recording, config))
+    compile_world = partial(_compile, recording, config, settle)
 
     T_world_cam = [_first_pose(recording)]
     T_world_body = [T_world_cam[0] @ T_cam_body]
-    velocity, twist = np.zeros(3), np.zeros(6)
+    velocity, twist, offset = np.zeros(3), np.zeros(6), np.zeros(3)
     records: list[tuple[bool, Tracked | None, float]] = []
     keyframes: list[Keyframe] = []
     world, far, mapped_at = None, 0.0, -np.inf
@@ -142,7 +147,7 @@ def run(
         tracked, lost = None, False
         if world is not None:
             dt = float(t[i] - t[i - 1])
-            readings = windows(i - 1, T_world_body[-1])
+            readings = windows(i - 1, T_world_body[-1], offset)
             interval, predicted = _interval(dt, T_world_body, t[:i], twist, velocity, readings, config.imu)
             where = gauge(config.frame, float(t[i - 1] - t[0]), T_world_body[-1], T_world_body[0], generator)
             tracked = world.track(
@@ -151,14 +156,17 @@ def run(
             )  # fmt: skip
             tracked = jax.device_get(tracked)
             params = tracked.params
-            lost = _failed(tracked, [r[1].loss for r in records if r[1] is not None and not r[0]], config)
+            lost = _failed(
+                tracked, [float(r[1].loss) for r in records if r[1] is not None and not r[0]], config
+            )
             T_ref_body = predicted if lost else np.asarray(tracked.T_ref_body, np.float64)
             T_world_body.append(_orthonormal(T_world_body[-1] @ T_ref_body))
             T_world_cam.append(T_world_body[-1] @ T_body_cam)
+            if i > 1 and not lost and config.imu in _USES_SPEED:  # the first speed is not known
+                error = T_world_body[-2][:3, :3] @ (T_ref_body[:3, 3] - predicted[:3, 3])
+                offset = observe_acceleration(offset, dt, error)
             twist = np.asarray(se3.log(jnp.asarray(T_ref_body, jnp.float32)), np.float64) / dt
-            velocity = end_velocity(
-                dt, T_ref_body, readings, speed=config.imu in ("accelerometer", "combined")
-            )
+            velocity = end_velocity(dt, T_ref_body, readings, speed=config.imu in _USES_SPEED)
 
         if not lost and t[i] - mapped_at >= config.map_every_s:
             points = _points(frame, recording, T_world_cam[-1])
@@ -184,19 +192,22 @@ def run(
     return _finish(recording, config, np.stack(T_world_cam), records, world, keyframes, key)
 
 
-def _inertial_windows(recording: Recording, config: SlamConfig) -> Callable[[int, np.ndarray], Readings]:
-    """The readings after each frame, given where the body was then; checks what can be checked beforehand."""
+def _inertial_windows(recording: Recording, config: SlamConfig) -> Callable[..., Readings]:
+    """The readings after each frame, given where the body was then and the acceleration read too much [m/s^2].
+
+    Checks what can be checked beforehand.
+    """
     if len(recording.t) < 2:
         raise DataError(f"{recording.name}: expected at least 2 frames, got {len(recording.t)}")
     if config.imu == "none":
         empty = no_readings()
-        return lambda i, T_world_ref: empty
+        return lambda i, T_world_ref, offset: empty
     if recording.imu is None:
         raise DataError(f"{recording.name}: --imu {config.imu} needs inertial readings, and there are none")
     readings, mask = inertial.windows(recording.imu, recording.t)
-    gravity = jnp.asarray(recording.gravity_world, jnp.float32)
 
-    def window(i, T_world_ref):
+    def window(i, T_world_ref, offset):
+        gravity = jnp.asarray(recording.gravity_world + offset, jnp.float32)
         local = inertial.Imu(*(jnp.asarray(x, jnp.float32) for x in (
             readings.t[i] - recording.t[i], readings.omega_body[i], readings.acceleration_body[i]
         )))  # fmt: skip
@@ -213,27 +224,31 @@ def _first_pose(recording: Recording) -> np.ndarray:
 
 def _interval(dt, T_world_body, t, twist, velocity, readings, mode) -> tuple[Interval, np.ndarray]:
     """What tracking starts from, and the predicted motion of the whole interval."""
-    stamps, poses = predict(
-        dt, twist, velocity, readings, rotation=mode != "none", speed=mode in ("accelerometer", "combined")
-    )
+    # Without two frames the speed is not known, and the accelerometer only changes it.
+    senses = {"rotation": mode != "none", "speed": mode in _USES_SPEED}
+    stamps, poses = predict(dt, twist, velocity, readings, **senses)
+    senses["speed"] &= len(t) > 1
     T_ref_world = np.linalg.inv(T_world_body[-1])
     behind = [max(len(t) - 1 - k, 0) for k in range(BEHIND + 1)]  # the last frame itself, and those before
     past = np.stack([T_ref_world @ T_world_body[k] for k in behind])
+    sigma = prediction_sigma(dt, poses[-1], **senses)
+    if len(t) == 1:
+        sigma = sigma + [0.3 * dt, 0.0 if senses["rotation"] else 0.3 * dt]  # as fast as a hand may move
     as_float = lambda x: jnp.asarray(x, jnp.float32)
-    interval = Interval(
+    return Interval(
         as_float(dt),
         as_float(np.concatenate([stamps, t[behind] - t[-1]])),
         as_float(np.concatenate([poses, past])),
+        as_float(sigma),
         readings,
-    )
-    return interval, poses[-1]
+    ), poses[-1]
 
 
 def _failed(tracked: Tracked, losses: list[float], config: SlamConfig) -> bool:
     """Whether tracking went wrong: too little of the image explained, or far worse than it usually is."""
     usual = float(np.median(losses[-30:])) if losses else np.inf
     explained = np.isfinite(tracked.loss) and tracked.valid >= config.track.minimum_valid
-    return not (explained and tracked.loss < 4 * usual)
+    return not (explained and tracked.loss < 2 * usual)
 
 
 def _points(frame: Frame, recording: Recording, T_world_cam: np.ndarray, step: int = 16) -> np.ndarray:
@@ -249,22 +264,18 @@ def _points(frame: Frame, recording: Recording, T_world_cam: np.ndarray, step: i
     return points @ T_world_cam[:3, :3].T + T_world_cam[:3, 3]
 
 
-def _compile(recording, config, framed, grid_config: GridConfig, state: MapState | None) -> _World:
+def _compile(recording, config, settle, grid_config: GridConfig, state: MapState | None) -> _World:
     """The map's compiled steps for a grid; a map that starts if there is no state yet."""
     scene = grid(grid_config)
-    scale = dict(band=grid_config.truncation, width=grid_config.truncation / 8)
-    map_config = replace(config.map, sample=replace(config.map.sample, **scale))
-    fused = config.map.method == "fused"
+    scale = {"band": grid_config.truncation, "width": grid_config.truncation / 8}
+    if config.map.method == "fused":
+        init_map, update = make_fuse(grid_config, recording.camera, grid_config.truncation)
+    else:
+        map_config = replace(config.map, sample=replace(config.map.sample, **scale))
+        init_map, update = make_descend(scene, recording.camera, map_config)
     track_config = replace(config.track, sample=replace(config.track.sample, **scale))
-    init_map, update = (
-        make_fuse(grid_config, recording.camera, grid_config.truncation)
-        if fused
-        else make_descend(scene, recording.camera, map_config)
-    )
-    weights = IMU_WEIGHTS[config.imu]
-    sigmas = _sigmas(recording, config)
     T_body_cam = jnp.asarray(recording.T_body_cam, jnp.float32)
-    track = make_track(scene, framed, recording.camera, T_body_cam, track_config, weights, sigmas)
+    track = make_track(scene, recording.camera, T_body_cam, track_config, settle)
     state = init_map(scene.init(jax.random.key(0))) if state is None else state
     return _World(grid_config, scene, state, _merge(state.params), track, update)
 
@@ -330,7 +341,9 @@ def _truth_error(recording: Recording, i: int, T_world_cam: list[np.ndarray]) ->
 def _finish(recording, config, T_world_cam, records, world, keyframes, key) -> SlamResult:
     """One field fitted to all poses, and everything that was recorded on the way."""
     t = recording.t - recording.t[0]
-    octaves = int(np.clip(np.ceil(np.log2(t[-1] / 0.5)) + 1, 5, 10))  # down to periods of half a second
+    # Down to periods of half a second, if the frames are dense enough to tell.
+    shortest = max(0.5, 4 * float(np.median(np.diff(t))))
+    octaves = int(np.clip(np.ceil(np.log2(max(t[-1] / shortest, 1))) + 1, 3, 10))
     net = posenet(replace(config.field, span=(0.0, float(t[-1])), octaves=octaves, head="free", window=None))
     T_world_first = jnp.asarray(T_world_cam[0], jnp.float32)
     field = PoseField(net.init, lambda params, s: se3.compose(T_world_first, net.pose(params, s)))

@@ -6,6 +6,7 @@ enough however long the recording. What the field's own output refers to (the pa
 it reads are compositions on top, `slam/frames.py`.
 """
 
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -19,11 +20,11 @@ from jaxpose.camera import Camera
 from jaxpose.fields import Params, pin
 from jaxpose.imu import ResidualSigmas
 from jaxpose.scenes import SceneField
-from jaxpose.slam.align import align
-from jaxpose.slam.frames import Framed
+from jaxpose.slam.align import align, best_start, starts
+from jaxpose.slam.frames import Framed, Gauge, Motion
 from jaxpose.slam.objective import ImuWeights, TrackConfig, image_loss, image_residuals, imu_loss
 from jaxpose.slam.observe import sample_pixels
-from jaxpose.slam.predict import AHEAD
+from jaxpose.slam.predict import AHEAD, Interval
 
 _POSE_SIGMA = 2e-3  # [m, rad] what the field should keep to poses within
 
@@ -39,73 +40,98 @@ class Tracked(NamedTuple):
     iterations: Int[Array, ""]
 
 
+class Settle(NamedTuple):
+    """What brings the field to a motion; compiled apart from the map, whose size may change.
+
+    `motion` is the field's since the last frame, `inertial` its loss against the readings, `bring` Adam's way to a
+    motion and to the readings, `pinned` that and Newton's to the poses at `interval.stamps[AHEAD - 1:]`.
+    """
+
+    motion: Motion
+    inertial: Callable[[Params, Gauge, Interval], Float[Array, ""]]
+    bring: Callable[[Params, Gauge, Interval], Params]
+    pinned: Callable[[Params, Gauge, Interval, Float[Array, "4 4"]], tuple[Params, Float[Array, "4 4"]]]
+
+
+def make_settle(framed: Framed, config: TrackConfig, weights: ImuWeights, sigmas: ResidualSigmas) -> Settle:
+    """The field's part of tracking, for a frame of reference and inertial weights."""
+    motion = framed.motion
+
+    def inertial(params, gauge, interval):
+        return imu_loss(motion(params, gauge), interval, weights, sigmas)
+
+    def descend(params, gauge, interval, stamps, T_ref_body):
+        def loss(params, i):
+            del i
+            error = jax.vmap(motion(params, gauge))(stamps) - T_ref_body
+            square = jnp.sum(error[:, :3] ** 2, axis=(-2, -1)) / _POSE_SIGMA**2
+            # Square near zero, so that Adam settles; else by size.
+            return jnp.mean(jnp.sqrt(1 + square)) + inertial(params, gauge, interval), jnp.zeros(0)
+
+        return _descend(loss, params, config, config.field_steps, config.field_steps)[0][0]
+
+    def bring(params, gauge, interval):
+        return descend(params, gauge, interval, interval.stamps, interval.T_ref_body)
+
+    @jax.jit
+    def pinned(params, gauge, interval, T_ref_body):
+        # The motion found at this frame, and that of the frames before.
+        stamps = interval.stamps[AHEAD - 1 :]
+        poses = interval.T_ref_body[AHEAD - 1 :].at[0].set(T_ref_body)
+        if any(weights):
+            params = descend(params, gauge, interval, stamps, poses)
+        params = pin(lambda p: jax.vmap(framed.direct(p, gauge))(stamps), params, poses)
+        return params, motion(params, gauge)(interval.t)
+
+    return Settle(motion, inertial, bring, pinned)
+
+
 def make_track(
     scene: SceneField,
-    framed: Framed,
     camera: Camera,
     T_body_cam: Float[Array, "4 4"],
     config: TrackConfig,
-    weights: ImuWeights,
-    sigmas: ResidualSigmas,
+    settle: Settle,
 ):
-    """The compiled tracking step `track(scene_params, params, T_world_ref, gauge, interval, image, far, key)`.
+    """The tracking step `track(scene_params, params, T_world_ref, gauge, interval, image, far, key) -> Tracked`.
 
-    It returns `Tracked`. The field starts from its own parameters, brought to the interval's predicted motion.
+    Its inner loops are compiled; the field starts from its own parameters `params`.
     """
 
-    motion = framed.motion
-
-    def bring(params, gauge, interval, T_ref_body, stamps):
-        """The field at the motion given at the stamps, and close to the inertial readings."""
-
-        def loss(params):
-            move = motion(params, gauge)
-            error = jax.vmap(move)(stamps) - T_ref_body
-            square = jnp.sum(error[:, :3] ** 2, axis=(-2, -1)) / _POSE_SIGMA**2
-            # Square near zero, so that Adam settles; else by size.
-            return jnp.mean(jnp.sqrt(1 + square)) + imu_loss(move, interval, weights, sigmas)
-
-        objective = lambda params, i: (loss(params), jnp.zeros(0))
-        (params, _), _ = _descend(objective, params, config, config.field_steps, config.field_steps)
-        return params
+    @jax.jit
+    def aligned(scene_params, T_world_ref, interval, image, far, key):
+        query = partial(scene.query, scene_params)
+        pixels = sample_pixels(key, image, camera, config.pixels, edge=config.edge)
+        tries = starts(interval.T_ref_body[AHEAD - 1], interval.sigma)
+        T_world_tries = se3.compose(T_world_ref, se3.compose(tries, T_body_cam))
+        start = best_start(query, T_world_tries, pixels, far, config)
+        found = align(query, start, T_world_tries[0], interval.sigma, pixels, far, config)
+        T_world_body = se3.compose(found.T_world_cam, se3.inverse(T_body_cam))
+        seen = found.loss, found.residuals.depth_error, found.residuals.valid, found.iterations
+        return se3.compose(se3.inverse(T_world_ref), T_world_body), seen
 
     def gauss_newton(scene_params, params, T_world_ref, gauge, interval, image, far, key):
-        pixels = sample_pixels(key, image, camera, config.pixels, edge=config.edge)
-        start = se3.compose(T_world_ref, se3.compose(interval.T_ref_body[AHEAD - 1], T_body_cam))
-        found = align(partial(scene.query, scene_params), start, pixels, far, config)
-        T_world_body = se3.compose(found.T_world_cam, se3.inverse(T_body_cam))
-        T_ref_body = se3.compose(se3.inverse(T_world_ref), T_world_body)
-        # The motion found at this frame, and that of the frames before.
-        stamps, poses = interval.stamps[AHEAD - 1 :], interval.T_ref_body[AHEAD - 1 :].at[0].set(T_ref_body)
-        if any(weights):
-            params = bring(params, gauge, interval, poses, stamps)
-        params = pin(lambda p: jax.vmap(framed.direct(p, gauge))(stamps), params, poses)
-        return Tracked(
-            params,
-            motion(params, gauge)(interval.t),
-            found.loss,
-            found.residuals.depth_error,
-            found.residuals.valid,
-            found.iterations,
-        )
+        T_ref_body, seen = aligned(scene_params, T_world_ref, interval, image, far, key)
+        return Tracked(*settle.pinned(params, gauge, interval, T_ref_body), *seen)
 
+    @jax.jit
     def gradient(scene_params, params, T_world_ref, gauge, interval, image, far, key):
-        params = bring(params, gauge, interval, interval.T_ref_body, interval.stamps)
+        params = settle.bring(params, gauge, interval)
         query = partial(scene.query, scene_params)
 
         def loss(params, i):
-            move = motion(params, gauge)
             pixels = sample_pixels(jax.random.fold_in(key, i), image, camera, config.pixels, edge=config.edge)
-            T_world_cam = se3.compose(T_world_ref, se3.compose(move(interval.t), T_body_cam))
+            T_ref_body = settle.motion(params, gauge)(interval.t)
+            T_world_cam = se3.compose(T_world_ref, se3.compose(T_ref_body, T_body_cam))
             found = image_residuals(query, T_world_cam, pixels, far, config)
             total = image_loss(found, config)
             seen = jnp.stack([total, found.depth_error, found.valid])
-            return total + imu_loss(move, interval, weights, sigmas), seen
+            return total + settle.inertial(params, gauge, interval), seen
 
         (params, seen), i = _descend(loss, params, config, config.iterations, config.patience)
-        return Tracked(params, motion(params, gauge)(interval.t), *seen, i)
+        return Tracked(params, settle.motion(params, gauge)(interval.t), *seen, i)
 
-    return jax.jit(gauss_newton if config.method == "gauss_newton" else gradient)
+    return gauss_newton if config.method == "gauss_newton" else gradient
 
 
 def _descend(objective, params, config: TrackConfig, iterations: int, patience: int):
