@@ -25,7 +25,7 @@ class TrackConfig:
     """
 
     method: Literal["gauss_newton", "gradient"] = "gauss_newton"
-    pixels: int = 600
+    pixels: int = 2500  # 200 to 1000 for `gradient`, which draws new ones in each iteration
     edge: int = 8  # [px] border left out
     iterations: int = 15  # at most; 150 for `gradient`
     patience: int = 30  # of `gradient`: iterations without a lower loss after which to stop
@@ -33,7 +33,7 @@ class TrackConfig:
     rotation_rate: float = 2e-4  # of RotsNet
     decay: float = 0.1  # of both rates over the iterations
     field_steps: int = 60  # Adam steps of bringing the field to the motion that is predicted or found
-    colour_weight: float = 0.1  # of the colour residual against the depth residual, both in sigmas
+    colour_weight: float = 0.03  # of the colour residual against the depth residual, both in sigmas
     minimum_valid: float = 0.2  # share of the pixels the map must explain
     sample: SampleConfig = SampleConfig()
 

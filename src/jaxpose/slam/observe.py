@@ -32,9 +32,9 @@ class Pixels(NamedTuple):
 class SampleConfig:
     """Samples along a ray: evenly up to the measured surface, denser through it, a few behind."""
 
-    front: int = 12
+    front: int = 6
     surface: int = 16
-    behind: int = 4
+    behind: int = 2
     band: float = 0.12  # [m] to either side of the measured depth that counts as the surface
     width: float = 0.015  # [m] thickness of a rendered surface (`render.sdf_weights`)
 
