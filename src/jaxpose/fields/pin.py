@@ -20,11 +20,11 @@ def pin(
 ) -> Params:
     """Parameters of a PoseNet at which `poses_of(params)` are the given poses, near those it has.
 
-    Only the output layers move, in which the network is linear up to its head: each Newton step is the shortest
-    change of their weights that brings the poses there to first order, J^T (J J^T)^-1 r. That is closer than
-    hundreds of Adam's steps on all layers, at the cost of a few. Where poses ask for what the features cannot
-    tell apart, `damping` (a share of the mean of J J^T's diagonal) lets them differ a little. The poses must be
-    the field's own: a common factor that cancels in them would be free to run away.
+    Only the output layers move, in which the network is linear up to its head: each Newton step is the
+    shortest change of their weights that brings the poses there to first order, J^T (J J^T)^-1 r. That is
+    closer than hundreds of Adam's steps on all layers, at the cost of a few. Where poses ask for what the
+    features cannot tell apart, `damping` (a share of the mean of J J^T's diagonal) lets them differ a
+    little. The poses must be the field's own: a common factor that cancels in them would be free to run away.
     """
     leaves, tree = jax.tree_util.tree_flatten_with_path(params)
     last = _output_layers([path for path, _ in leaves])
@@ -34,7 +34,8 @@ def pin(
         rest = iter(moving)
         merged = [next(rest) if moves else leaf for moves, leaf in zip(last, values, strict=True)]
         error = se3.compose(se3.inverse(poses), poses_of(jax.tree_util.tree_unflatten(tree, merged)))
-        # The twist to first order, which is all that Newton needs, and far quicker to compile than the logarithm.
+        # The twist to first order, which is all that Newton needs, and far quicker to compile than the
+        # logarithm.
         turn = se3.vee(error[:, :3, :3] - jnp.swapaxes(error[:, :3, :3], 1, 2)) / 2
         return jnp.concatenate([error[:, :3, 3], turn], axis=-1).ravel()
 
@@ -54,7 +55,7 @@ def pin(
 
 
 def _output_layers(paths) -> list[bool]:
-    """Which leaves belong to the last layer of their network: `layer_<number>` is the second name from the end."""
+    """Which leaves belong to the last layer of their network, `layer_<number>` in their path."""
     names = [[entry.key for entry in path] for path in paths]
     networks = [tuple(name[:-2]) for name in names]
     numbers = [int(name[-2].rsplit("_", 1)[1]) if len(name) > 1 else -1 for name in names]

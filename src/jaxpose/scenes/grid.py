@@ -68,7 +68,7 @@ def grid(config: GridConfig) -> SceneField:
 
 
 def box(
-    points: np.ndarray, *, voxel: float | None = None, levels: int = 2, nodes: int = 700_000
+    points: np.ndarray, *, voxel: float | None = None, levels: int = 2, nodes: int = 1_200_000
 ) -> GridConfig:
     """A grid around world points (n, 3) [m], a quarter of its size wider on every side.
 
@@ -93,7 +93,7 @@ def grow(config: GridConfig, state: Any, points: np.ndarray) -> tuple[GridConfig
     cell = config.voxel * RATIO ** (config.levels - 1)
     lower, upper = np.array(config.lower), np.array(config.upper)
     low, high = points.min(axis=0), points.max(axis=0)
-    margin = 0.15 * (upper - lower)
+    margin = 0.3 * (upper - lower)
     before = np.where(low < lower, np.ceil((lower - low + margin) / cell), 0).astype(int)
     after = np.where(high > upper, np.ceil((high - upper + margin) / cell), 0).astype(int)
     widths = {

@@ -29,7 +29,7 @@ class Alignment(NamedTuple):
 
 
 def starts(T_ref_body: Float[Array, "4 4"], sigma: Float[Array, "2"]) -> Float[Array, "k 4 4"]:
-    """Motions to try at first: the predicted one, and some around it, `sigma` [m, rad] away along each axis."""
+    """Motions to try first: the predicted one, and those `sigma` [m, rad] away along each axis."""
     axes = jnp.concatenate([jnp.eye(6), -jnp.eye(6)]) * jnp.repeat(sigma, 3)[None]
     return jnp.concatenate([T_ref_body[None], se3.compose(T_ref_body, se3.exp(axes))])
 
@@ -43,7 +43,7 @@ def best_start(
     *,
     count: int = 150,
 ) -> Float[Array, "4 4"]:
-    """The candidate pose that explains the first `count` pixels best; pixels it does not explain count as bad."""
+    """The candidate pose that explains the first `count` pixels best; unexplained ones count as bad."""
     few = jax.tree.map(lambda x: x[:count], pixels)
 
     def score(T):
@@ -66,8 +66,9 @@ def align(
     """The pose that minimises the L1 image loss near a start, by reweighted Gauss-Newton steps.
 
     Six forward passes along the directions of the tangent space give the Jacobian. A step that makes the loss
-    worse is taken back and tried again with ten times the damping. The predicted pose is a measurement too, with
-    `sigma` [m, rad]; against it the image counts as `_INDEPENDENT` pixels, since errors of a map go together.
+    worse is taken back and tried again with ten times the damping. The predicted pose is a measurement too,
+    with `sigma` [m, rad]; against it the image counts as `_INDEPENDENT` pixels, since errors of a map go
+    together.
     """
     prior = jnp.repeat(sigma, 3) ** -2
 

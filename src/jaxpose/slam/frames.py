@@ -1,7 +1,8 @@
 """What the tracked field's output refers to: the paper's table 9, and one of ours, as compositions.
 
 Tracking asks for the body's motion since the last frame, a function of the seconds since then. A frame of
-reference turns a field into that. What changes from frame to frame is a traced `Gauge`, so nothing recompiles.
+reference turns a field into that. What changes from frame to frame is a traced `Gauge`, so nothing
+recompiles.
 """
 
 from collections.abc import Callable
@@ -31,8 +32,8 @@ Motion = Callable[[Params, Gauge], PoseFn]
 class Framed(NamedTuple):
     """A field in a frame of reference.
 
-    `motion` is the body's since the last frame. `direct` is the same without the anchor: equal to it where the
-    field is the identity at the last frame, and without the anchor's freedom of gauge.
+    `motion` is the body's since the last frame. `direct` is the same without the anchor: equal to it where
+    the field is the identity at the last frame, and without the anchor's freedom of gauge.
     """
 
     field: PoseField

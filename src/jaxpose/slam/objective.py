@@ -21,7 +21,8 @@ class TrackConfig:
     """How one frame is tracked.
 
     `gradient` is the paper's: Adam on the field through the renderer, pixels drawn anew in each iteration.
-    `gauss_newton` first moves the pose itself by second-order steps, then brings the field there (`align.py`).
+    `gauss_newton` first moves the pose itself by second-order steps, then brings the field there
+    (`align.py`).
     """
 
     method: Literal["gauss_newton", "gradient"] = "gauss_newton"
@@ -33,13 +34,13 @@ class TrackConfig:
     rotation_rate: float = 2e-4  # of RotsNet
     decay: float = 0.1  # of both rates over the iterations
     field_steps: int = 60  # Adam steps of bringing the field to the motion that is predicted or found
-    colour_weight: float = 0.03  # of the colour residual against the depth residual, both in sigmas
+    colour_weight: float = 0.1  # of the colour residual against the depth residual, both in sigmas
     minimum_valid: float = 0.2  # share of the pixels the map must explain
     sample: SampleConfig = SampleConfig()
 
 
 class ImuWeights(NamedTuple):
-    """Weights of the three inertial losses (METHOD section 5, point 4); 0 leaves one out of the computation."""
+    """Weights of the three inertial losses (METHOD section 5, point 4); 0 leaves one out."""
 
     loose: float = 0.0
     tight: float = 0.0
@@ -49,9 +50,9 @@ class ImuWeights(NamedTuple):
 class Residuals(NamedTuple):
     """Rendered minus measured at pixels, each in its sigmas, and which pixels count."""
 
-    depth: Float[Array, "n"]
+    depth: Float[Array, " n"]
     colour: Float[Array, "n 3"]
-    inlier: Float[Array, "n"]  # 1 or 0, without gradient
+    inlier: Float[Array, " n"]  # 1 or 0, without gradient
     depth_error: Float[Array, ""]  # [m] median over explained pixels
     valid: Float[Array, ""]  # share of the pixels with depth that the map explains
 
@@ -89,7 +90,7 @@ def image_loss(residuals: Residuals, config: TrackConfig) -> Float[Array, ""]:
 def imu_loss(
     motion: PoseFn, interval: Interval, weights: ImuWeights, sigmas: ResidualSigmas
 ) -> Float[Array, ""]:
-    """The weighted inertial L1 losses, each in units of its sigma, means over readings and axes; 0 without any."""
+    """The weighted inertial L1 losses, each in its sigmas, means over readings and axes."""
     if not any(weights):
         return jnp.zeros(())
     readings = interval.readings

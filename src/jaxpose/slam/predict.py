@@ -41,7 +41,7 @@ def integrate(
     imu: Imu, mask: Bool[Array, " s"], R_world_ref: Float[Array, "3 3"], gravity_world: Float[Array, "3"]
 ) -> Readings:
     """Rotation, velocity and position that an interval's readings add up to, in the frame of its start."""
-    R_ref_body = inertial.integrate_gyro(jnp.eye(3), imu.t, imu.omega_body, mask)
+    R_ref_body = inertial.integrate_gyro(jnp.eye(3), jnp.asarray(imu.t), jnp.asarray(imu.omega_body), mask)
     R_world_body = jnp.matmul(R_world_ref[None], R_ref_body, precision="highest")
     acceleration_body = inertial.remove_gravity(imu, R_world_body, gravity_world)
     acceleration_ref = jnp.einsum("sij,sj->si", R_ref_body, acceleration_body, precision="highest")
@@ -104,7 +104,7 @@ def prediction_sigma(t: float, T_ref_body: np.ndarray, *, rotation: bool, speed:
 
 
 def end_velocity(t: float, T_ref_body: np.ndarray, readings: Readings, *, speed: bool) -> np.ndarray:
-    """Velocity [m/s] of the body at the end of an interval over which it moved by `T_ref_body`, in its axes then.
+    """Velocity [m/s] of the body, in its axes, at the end of an interval of motion `T_ref_body`.
 
     With `speed`, the mean velocity is carried to the end by the accelerometer.
     """
@@ -124,11 +124,11 @@ def observe_acceleration(
     sigma: float = 0.1,
     position_sigma: float = 0.01,
 ) -> np.ndarray:
-    """What the accelerometer reads too much [m/s^2] in the world, after a prediction was off by `error_world` [m].
+    """The false acceleration [m/s^2] in the world, after a prediction was off by `error_world` [m].
 
-    A tilt of the tracked world against gravity, or a bias of the sensor, pushes every prediction the same way,
-    by about the false acceleration times t^2. The gain is Kalman's for an offset known to `sigma` [m/s^2] and
-    positions known to `position_sigma` [m]: long intervals teach much, short ones little.
+    A tilt of the tracked world against gravity, or a bias of the sensor, pushes every prediction the same
+    way, by about the false acceleration times t^2. The gain is Kalman's for an offset known to `sigma`
+    [m/s^2] and positions known to `position_sigma` [m]: long intervals teach much, short ones little.
     """
     gain = (sigma * t**2) ** 2 / ((sigma * t**2) ** 2 + position_sigma**2)
     return offset_world + gain * error_world / t**2

@@ -66,6 +66,21 @@ class SlamConfig:
     keyframe_overlap: float = 0.9  # a frame that shares less with every keyframe becomes one
     imu_noise: ImuNoise = ADIS16448
 
+    def __post_init__(self):
+        positive = {
+            "track.pixels": self.track.pixels,
+            "track.iterations": self.track.iterations,
+            "track.field_steps": self.track.field_steps,
+            "map.window": self.map.window,
+            "map.iterations": self.map.iterations,
+            "map.first_iterations": self.map.first_iterations,
+            "field.layers": self.field.layers,
+            "field.width": self.field.width,
+        }
+        for name, value in positive.items():
+            if value < 1:
+                raise ValueError(f"{name}: expected 1 or more, got {value}")
+
 
 class Progress(NamedTuple):
     """One frame done; `truth_error` [m] is the distance to the truth with the first poses put together."""
@@ -168,8 +183,10 @@ def run(
             twist = np.asarray(se3.log(jnp.asarray(T_ref_body, jnp.float32)), np.float64) / dt
             velocity = end_velocity(dt, T_ref_body, readings, speed=config.imu in _USES_SPEED)
 
-        if not lost and t[i] - mapped_at >= config.map_every_s:
-            points = _points(frame, recording, T_world_cam[-1])
+        points = _points(frame, recording, T_world_cam[-1])
+        if world is None and len(points) == 0:
+            raise DataError(f"{recording.name}: expected depth in the first frame, found none")
+        if not lost and len(points) and t[i] - mapped_at >= config.map_every_s:
             far = max(
                 far, 1.2 * float(np.percentile(np.linalg.norm(points - T_world_cam[-1][:3, 3], axis=1), 99))
             )
@@ -183,6 +200,7 @@ def run(
             mapped_at = t[i]
             if not keyframes or shares.max() < config.keyframe_overlap:
                 keyframes.append(Keyframe(i, image, T_world_cam[-1]))
+        assert world is not None  # made from the first frame
         jax.block_until_ready(world.merged)
         seconds = time.perf_counter() - started
         records.append((lost, tracked, seconds))
@@ -193,7 +211,7 @@ def run(
 
 
 def _inertial_windows(recording: Recording, config: SlamConfig) -> Callable[..., Readings]:
-    """The readings after each frame, given where the body was then and the acceleration read too much [m/s^2].
+    """The readings after each frame, given the body's pose and the false acceleration [m/s^2] then.
 
     Checks what can be checked beforehand.
     """
@@ -252,13 +270,11 @@ def _failed(tracked: Tracked, losses: list[float], config: SlamConfig) -> bool:
 
 
 def _points(frame: Frame, recording: Recording, T_world_cam: np.ndarray, step: int = 16) -> np.ndarray:
-    """World points of every 16th pixel with depth, float64."""
+    """World points (n, 3) of every 16th pixel in both directions that has depth, float64."""
     camera = recording.camera
     row, column = np.mgrid[step // 2 : camera.height : step, step // 2 : camera.width : step]
     depth = frame.depth[row, column]
     seen = depth > 0
-    if not seen.any():
-        raise DataError(f"{recording.name}: expected depth in a frame to be mapped, found none")
     ray = np.stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy, np.ones(row.shape)], -1)
     points = ray[seen] * depth[seen][:, None]
     return points @ T_world_cam[:3, :3].T + T_world_cam[:3, 3]

@@ -43,8 +43,9 @@ class Tracked(NamedTuple):
 class Settle(NamedTuple):
     """What brings the field to a motion; compiled apart from the map, whose size may change.
 
-    `motion` is the field's since the last frame, `inertial` its loss against the readings, `bring` Adam's way to a
-    motion and to the readings, `pinned` that and Newton's to the poses at `interval.stamps[AHEAD - 1:]`.
+    `motion` is the field's since the last frame, `inertial` its loss against the readings, `bring` Adam's
+    way to a motion and to the readings, `pinned` that and Newton's to the poses at `interval.stamps[AHEAD -
+    1:]`.
     """
 
     motion: Motion
@@ -93,7 +94,7 @@ def make_track(
     config: TrackConfig,
     settle: Settle,
 ):
-    """The tracking step `track(scene_params, params, T_world_ref, gauge, interval, image, far, key) -> Tracked`.
+    """The step `track(scene_params, params, T_world_ref, gauge, interval, image, far, key) -> Tracked`.
 
     Its inner loops are compiled; the field starts from its own parameters `params`.
     """
@@ -129,7 +130,8 @@ def make_track(
             return total + settle.inertial(params, gauge, interval), seen
 
         (params, seen), i = _descend(loss, params, config, config.iterations, config.patience)
-        return Tracked(params, settle.motion(params, gauge)(interval.t), *seen, i)
+        image, error, valid = seen
+        return Tracked(params, settle.motion(params, gauge)(interval.t), image, error, valid, i)
 
     return gauss_newton if config.method == "gauss_newton" else gradient
 
@@ -137,8 +139,8 @@ def make_track(
 def _descend(objective, params, config: TrackConfig, iterations: int, patience: int):
     """Adam on `objective(params, i) -> (loss, seen)` until it no longer falls for `patience` iterations.
 
-    Returns the parameters with running means of `seen`, and the iterations used. The loss is judged by running
-    means too: pixels differ from one iteration to the next.
+    Returns the parameters with running means of `seen`, and the iterations used. The loss is judged by
+    running means too: pixels differ from one iteration to the next.
     """
     rates = _rates(params, {"translation": config.learning_rate, "rotation": config.rotation_rate})
     adam = optax.scale_by_adam()
@@ -167,7 +169,7 @@ def _descend(objective, params, config: TrackConfig, iterations: int, patience: 
 
 
 def _rates(params, rates):
-    """Adam's rate for every leaf: that of the network it belongs to, at whatever depth the networks' names are."""
+    """Adam's rate for every leaf: that of the network it belongs to, however deep its name is."""
 
     def rate(path, leaf):
         names = [entry.key for entry in path if isinstance(entry, jax.tree_util.DictKey)]
