@@ -71,7 +71,8 @@ def image_residuals(
     sigma = jnp.sqrt(jax.lax.stop_gradient(seen.variance) + depth_sigma(pixels.depth) ** 2)
     depth = error / sigma
     valid = (pixels.depth > 0) & (seen.opacity > 0.5)
-    inlier = valid & (jnp.abs(depth) < 10 * median(jnp.abs(depth), valid))
+    # However well the others fit, three sigmas are no outlier.
+    inlier = valid & (jnp.abs(depth) < jnp.maximum(10 * median(jnp.abs(depth), valid), 3))
     colour = seen.rgb - pixels.rgb
     spread = jnp.maximum(median(jnp.mean(jnp.abs(colour), axis=-1), inlier), 0.01)
     share = jnp.sum(valid) / jnp.maximum(jnp.sum(pixels.depth > 0), 1)
@@ -97,7 +98,7 @@ def imu_loss(
     found = inertial.imu_residuals(
         motion,
         jnp.where(readings.mask, readings.imu.t, 0),
-        readings.imu.omega_body,
+        jnp.asarray(readings.imu.omega_body),
         readings.acceleration_body,
         readings.R_ref_body,
     )  # what is not read below is not computed
