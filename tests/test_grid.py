@@ -187,7 +187,7 @@ def test_growing_to_what_is_inside_changes_nothing():
 @pytest.mark.parametrize("levels", [1, 2])
 def test_a_box_covers_its_points(levels):
     points = np.random.default_rng(5).normal(size=(100, 3)) * [3, 1, 2]
-    config = box(points, levels=levels)
+    config = box(points, levels=levels, nodes=400_000)
     assert np.all(points >= np.array(config.lower) + 0.2) and np.all(points <= np.array(config.upper) - 0.2)
     nodes = node_positions(config)
     assert nodes.shape[:3] == grid(config).init(jax.random.key(0))[-1].shape[:3]
