@@ -1,24 +1,22 @@
 """What the SLAM experiments do: run, measure, draw, and write the run folder."""
 
-import json
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxpose import io, plots, se3
+from jaxpose import io, plots
 from jaxpose.experiments.slam_measure import Accuracy, Inertial, accuracy, cost, inertial, views
 from jaxpose.experiments.slam_options import Options, Source, load, slam_config
 from jaxpose.experiments.slam_report import table
-from jaxpose.fields import Params, PoseField, PoseNetConfig, posenet
+from jaxpose.fields import Params, PoseField, bspline
 from jaxpose.recording import Recording
 from jaxpose.slam.run import ImuMode, Progress, SlamResult
 from jaxpose.slam.run import run as track
@@ -120,7 +118,7 @@ def _single(
     io.write_tum(folder / "trajectory.txt", io.Trajectory(recording.t, result.T_world_cam))
     if truth is not None:
         io.write_tum(folder / "reference.txt", io.Trajectory(recording.t, truth))
-    _save_field(folder / "field.npz", options, recording, result)
+    _save_field(folder / "field.npz", recording, result)
     io.write_json(folder / "config.json", options)
     results |= {
         "notes": recording.notes,
@@ -159,20 +157,11 @@ def _draw(
         plots.inertial(folder / "inertial.png", motion.t, motion.gyro, motion.accelerometer, title)
 
 
-def _save_field(path: Path, options: Options, recording: Recording, result: SlamResult) -> None:
-    """The final field: weights by name, such as `translation/layer_0/kernel`, settings, first pose."""
-    leaves = jax.tree_util.tree_flatten_with_path(result.field_params)[0]
-    weights: dict[str, Any] = {"/".join(key.key for key in keys): np.asarray(leaf) for keys, leaf in leaves}
-    inputs = next(iter(result.field_params.values()))["layer_0"]["kernel"].shape[0]
-    config = replace(
-        slam_config(options).field,
-        span=(0.0, float(recording.t[-1])),
-        octaves=(inputs - 1) // 2,
-        head="free",
-        window=None,
-    )
+def _save_field(path: Path, recording: Recording, result: SlamResult) -> None:
+    """The final field: the control poses of its B-spline and the time they span [s]."""
     with io.atomic(path) as temporary:
-        np.savez(temporary, T_world_first=result.T_world_cam[0], config=json.dumps(asdict(config)), **weights)
+        span = recording.t[[0, -1]] - recording.t[0]
+        np.savez(temporary, control_points=np.asarray(result.field_params), span=span)
 
 
 def load_field(folder: Path | str) -> tuple[PoseField, Params]:
@@ -181,11 +170,5 @@ def load_field(folder: Path | str) -> tuple[PoseField, Params]:
     `t` is in seconds on the clock of `trajectory.txt`, anywhere between its first and last.
     """
     with np.load(Path(folder) / "field.npz") as file:
-        settings = json.loads(str(file["config"]))
-        T_world_first = jnp.asarray(file["T_world_first"], jnp.float32)
-        params: dict[str, Any] = {}
-        for name in set(file.files) - {"config", "T_world_first"}:
-            network, layer, kind = name.split("/")
-            params.setdefault(network, {}).setdefault(layer, {})[kind] = jnp.asarray(file[name])
-    net = posenet(PoseNetConfig(**settings | {"span": tuple(settings["span"])}))
-    return PoseField(net.init, lambda p, t: se3.compose(T_world_first, net.pose(p, t))), params
+        params, (first, last) = jnp.asarray(file["control_points"], jnp.float32), file["span"]
+    return bspline((float(first), float(last)), params.shape[0] - 3), params

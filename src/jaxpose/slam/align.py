@@ -119,7 +119,7 @@ def align(
     nothing = Residuals(
         jnp.zeros(count), jnp.zeros((count, 3)), jnp.zeros(count), jnp.zeros(()), jnp.zeros(())
     )
-    start = Alignment(T_world_cam, jnp.zeros((6, 6)), jnp.inf, nothing, jnp.int32(0))
+    start = Alignment(T_world_cam, jnp.zeros((6, 6)), jnp.float32(jnp.inf), nothing, jnp.int32(0))
     carry = (start, jnp.inf, (T_world_cam, jnp.zeros(6)), jnp.float32(1e-2), jnp.inf, jnp.int32(0))
     best, *_, i = jax.lax.while_loop(unsettled, improve, carry)
     return best._replace(iterations=i)

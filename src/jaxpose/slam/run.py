@@ -13,7 +13,7 @@ import numpy as np
 from jaxpose import imu as inertial
 from jaxpose import se3
 from jaxpose.errors import DataError
-from jaxpose.fields import PoseField, PoseNetConfig, fit, posenet
+from jaxpose.fields import PoseField, PoseNetConfig, bspline, control_points, fit, stamped
 from jaxpose.imu import ADIS16448, ImuNoise, ResidualSigmas
 from jaxpose.recording import Frame, Recording
 from jaxpose.scenes import GridConfig, SceneField, box, grid, grow, merge
@@ -207,7 +207,7 @@ def run(
         if on_frame is not None:
             on_frame(Progress(i, len(t), tracked, lost, _truth_error(recording, i, T_world_cam), seconds))
 
-    return _finish(recording, config, np.stack(T_world_cam), records, world, keyframes, key)
+    return _finish(recording, np.stack(T_world_cam), records, world, keyframes)
 
 
 def _inertial_windows(recording: Recording, config: SlamConfig) -> Callable[..., Readings]:
@@ -354,16 +354,20 @@ def _truth_error(recording: Recording, i: int, T_world_cam: list[np.ndarray]) ->
     return float(np.linalg.norm(recording.T_world_cam[i, :3, 3] - T_world_cam[i][:3, 3]))
 
 
-def _finish(recording, config, T_world_cam, records, world, keyframes, key) -> SlamResult:
-    """One field fitted to all poses, and everything that was recorded on the way."""
+def _finish(recording, T_world_cam, records, world, keyframes) -> SlamResult:
+    """One field fitted to all poses, and everything that was recorded on the way.
+
+    A B-spline with a knot a frame: a PoseNet over the same 12 s of the default room stayed 1.5 cm from the
+    poses, and where the camera had turned once around it took the other way.
+    """
     t = recording.t - recording.t[0]
-    # Down to periods of half a second, if the frames are dense enough to tell.
-    shortest = max(0.5, 4 * float(np.median(np.diff(t))))
-    octaves = int(np.clip(np.ceil(np.log2(max(t[-1] / shortest, 1))) + 1, 3, 10))
-    net = posenet(replace(config.field, span=(0.0, float(t[-1])), octaves=octaves, head="free", window=None))
-    T_world_first = jnp.asarray(T_world_cam[0], jnp.float32)
-    field = PoseField(net.init, lambda params, s: se3.compose(T_world_first, net.pose(params, s)))
-    fitted = fit(field, t, T_world_cam, key=key, steps=2000)
+    span = (0.0, float(t[-1]))
+    intervals = max(round(t[-1] / float(np.median(np.diff(t)))), 1)
+    field = bspline(span, intervals)
+    knots = (np.arange(intervals + 3) - 1) * (t[-1] / intervals)
+    between = jax.vmap(stamped(jnp.asarray(t, jnp.float32), jnp.asarray(T_world_cam, jnp.float32)))
+    start = control_points(between(jnp.asarray(knots, jnp.float32)))
+    fitted = fit(field, t, T_world_cam, params=start, steps=400, learning_rate=1e-3)
     default = Tracked(None, np.eye(4), *[np.nan] * 3, 0)  # type: ignore[arg-type]
     each = [tracked or default for _, tracked, _ in records]
     return SlamResult(
