@@ -12,6 +12,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import NullFormatter
 
 from jaxpose.io import atomic
 
@@ -218,6 +219,7 @@ def comparison(
         ):  # one lost the camera: the others shall stay readable
             curves.set_yscale("log")
             bars.set_xscale("log")
+            bars.xaxis.set_minor_formatter(NullFormatter())  # the bars carry their numbers
         curves.legend(loc="best", ncols=2)
         names = list(rmse)[::-1]
         drawn = bars.barh(names, [rmse[n] for n in names], color=[_MODES.get(n, ESTIMATE) for n in names])
