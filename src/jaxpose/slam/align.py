@@ -20,9 +20,7 @@ class Alignment(NamedTuple):
     """A pose, how well it explains the image, and the information the image holds about it."""
 
     T_world_cam: Float[Array, "4 4"]
-    information: Float[
-        Array, "6 6"
-    ]  # Gauss-Newton's matrix over right increments; its inverse is a covariance
+    information: Float[Array, "6 6"]  # Gauss-Newton's matrix over right increments
     loss: Float[Array, ""]
     residuals: Residuals
     iterations: Int[Array, ""]

@@ -15,6 +15,7 @@ from jaxpose import se3
 from jaxpose.errors import DataError
 from jaxpose.fields import PoseField, PoseNetConfig, bspline, control_points, fit, stamped
 from jaxpose.imu import ADIS16448, ImuNoise, ResidualSigmas
+from jaxpose.metrics import nearest_rotation
 from jaxpose.recording import Frame, Recording
 from jaxpose.scenes import GridConfig, SceneField, box, grid, grow, merge
 from jaxpose.slam.frames import FrameName, gauge, make_field
@@ -132,7 +133,7 @@ def run(
     """Track every frame of an RGB-D recording and map what it sees (paper section 3.4, METHOD section 5).
 
     The world's frame is that of the truth where its first pose is known (as in NICE-SLAM), else the first
-    camera's, levelled by the accelerometer if there is one. Raises DataError where the recording cannot be
+    camera's; `gravity_world` must be in that frame. Raises DataError where the recording cannot be
     tracked: fewer than two frames, no depth in the first, IMU asked for and not there.
     """
     windows = _inertial_windows(recording, config)
@@ -175,7 +176,8 @@ def run(
                 tracked, [float(r[1].loss) for r in records if r[1] is not None and not r[0]], config
             )
             T_ref_body = predicted if lost else np.asarray(tracked.T_ref_body, np.float64)
-            T_world_body.append(_orthonormal(T_world_body[-1] @ T_ref_body))
+            T_world_body.append(T_world_body[-1] @ T_ref_body)
+            T_world_body[-1][:3, :3] = nearest_rotation(T_world_body[-1][:3, :3])  # float32 adds up
             T_world_cam.append(T_world_body[-1] @ T_body_cam)
             if i > 1 and not lost and config.imu in _USES_SPEED:  # the first speed is not known
                 error = T_world_body[-2][:3, :3] @ (T_ref_body[:3, 3] - predicted[:3, 3])
@@ -339,13 +341,6 @@ def _mapped(world, image, T_world_cam, keyframes, shares, far, config, generator
         key,
     )
     return world._replace(state=state, merged=_merge(state.params))
-
-
-def _orthonormal(T: np.ndarray) -> np.ndarray:
-    u, _, vt = np.linalg.svd(T[:3, :3])
-    T = T.copy()
-    T[:3, :3] = u @ vt
-    return T
 
 
 def _truth_error(recording: Recording, i: int, T_world_cam: list[np.ndarray]) -> float:
