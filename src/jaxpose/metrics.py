@@ -59,6 +59,23 @@ class Rpe(NamedTuple):
     skipped: int
 
 
+class PoseErrors(NamedTuple):
+    """Errors of camera poses after a similarity; means over views, then one value per row of the input.
+
+    Lengths are in the reference's unit; rows left out for a NaN or an infinity are NaN.
+    """
+
+    rotation_deg: float
+    translation: float  # between world-to-camera translation vectors, as BARF reports it
+    centre: float  # between camera centres
+    rotation_errors_deg: Float[np.ndarray, " n"]
+    translation_errors: Float[np.ndarray, " n"]
+    centre_errors: Float[np.ndarray, " n"]
+    alignment: Similarity  # estimate -> reference
+    frames: int  # rows used
+    skipped: int
+
+
 def nearest_rotation(matrix: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n 3 3"]:
     """The rotations closest (least squares) to finite 3x3 matrices; never a reflection."""
     left, _, right = np.linalg.svd(matrix)
@@ -156,6 +173,57 @@ def rpe(
     rotation[used] = rotation_angle_deg(moved[:, :3, :3], truth[:, :3, :3])
     pairs = int(used.sum())
     return Rpe(statistics(translation), statistics(rotation), translation, rotation, pairs, len(used) - pairs)
+
+
+def procrustes(estimate: Float[np.ndarray, "n 4 4"], reference: Float[np.ndarray, "n 4 4"]) -> Similarity:
+    """The similarity of BARF's evaluation, which maps estimated camera centres onto the reference's.
+
+    Unlike `umeyama` its scale is the ratio of the centres' spreads, so it does not shrink a bad estimate.
+    What the centres leave free (cameras on a line, or all in one place) is settled by the orientations; where
+    the estimate is all in one place the scale is 1. DataError on fewer than three pairs of finite poses.
+    """
+    used = _usable(estimate, reference)
+    if used.sum() < 3:
+        raise DataError(f"pose errors: expected at least 3 pairs of finite poses, got {used.sum()}")
+    estimate, reference = estimate[used], reference[used]
+    center_estimate, points = _centered(estimate[:, :3, 3])
+    center_reference, targets = _centered(reference[:, :3, 3])
+    spread, target_spread = np.sqrt(np.sum(points**2)), np.sqrt(np.sum(targets**2))
+    covariance = targets.T @ points / (spread * target_spread or 1)
+    orientations = np.mean(reference[:, :3, :3] @ estimate[:, :3, :3].swapaxes(1, 2), axis=0)
+    # So faint that it decides only where the centres do not.
+    rotation = nearest_rotation(covariance + 1e-9 * orientations)
+    scale = float(target_spread / spread) if spread > 0 else 1.0
+    return Similarity(scale, rotation, center_reference - scale * rotation @ center_estimate)
+
+
+def pose_errors(estimate: Float[np.ndarray, "n 4 4"], reference: Float[np.ndarray, "n 4 4"]) -> PoseErrors:
+    """Errors of camera-to-world poses after `procrustes`, as BARF (ICCV 2021) evaluates; DataError likewise.
+
+    Angles come from `rotation_angle_deg`; BARF's own formula cannot tell angles below 0.026 degrees from it.
+    A world-to-camera vector turns with the camera, so `translation` also holds a share of the rotation error
+    that grows with the distance to the origin; `centre` does not.
+    """
+    alignment = procrustes(estimate, reference)
+    used = _usable(estimate, reference)
+    aligned, truth = align(alignment, estimate[used]), np.asarray(reference[used], np.float64)
+    rotation, translation, centre = np.full((3, len(used)), np.nan)
+    rotation[used] = rotation_angle_deg(aligned[:, :3, :3], truth[:, :3, :3])
+    vectors = [np.einsum("nji,nj->ni", T[:, :3, :3], T[:, :3, 3]) for T in (aligned, truth)]
+    translation[used] = np.linalg.norm(vectors[0] - vectors[1], axis=-1)
+    centre[used] = np.linalg.norm(aligned[:, :3, 3] - truth[:, :3, 3], axis=-1)
+    means = [float(np.mean(values[used])) for values in (rotation, translation, centre)]
+    frames = int(used.sum())
+    per_view = (rotation, translation, centre)
+    return PoseErrors(
+        means[0],
+        means[1],
+        means[2],
+        *per_view,
+        alignment=alignment,
+        frames=frames,
+        skipped=len(used) - frames,
+    )
 
 
 def rotation_angle_deg(

@@ -1,11 +1,13 @@
-"""What a loader returns: a camera recording with depth, images read lazily."""
+"""What a loader returns: a camera recording with depth, images read lazily, or photographs held in memory."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int, UInt8
 
 from jaxpose.camera import Camera
+from jaxpose.errors import DataError
 from jaxpose.imu import Imu
 
 
@@ -30,6 +32,21 @@ class Recording(NamedTuple):
     notes: tuple[str, ...] = ()  # what the loader has to tell the user
 
 
+class Photographs(NamedTuple):
+    """Images of a scene at rest, in memory, with the poses that their source states; camera axes OpenCV."""
+
+    name: str
+    camera: Camera
+    t: Float[np.ndarray, " n"]  # [s], or the frame index where there are no stamps, as `notes` then says
+    rgb: UInt8[np.ndarray, "n h w 3"]  # on white where the file had alpha
+    T_world_cam: Float[np.ndarray, "n 4 4"]  # float64, finite
+    near: float  # depth along the optical axis at which the scene begins and ends [scene units]
+    far: float
+    spacing: Literal["depth", "disparity"]  # what samples between near and far are equally spaced in
+    files: tuple[str, ...]  # each image's name, as its source writes it
+    notes: tuple[str, ...] = ()  # what the loader has to tell the user
+
+
 def select(recording: Recording, indices: np.ndarray) -> Recording:
     """The recording reduced to some of its frames; the clock (and so the IMU) stays as it is."""
     poses = recording.T_world_cam
@@ -44,3 +61,29 @@ def thin(recording: Recording, rate_hz: float) -> Recording:
     """Keep frames so that their rate is at most `rate_hz`, the first of each period."""
     period = np.floor((recording.t - recording.t[0]) * rate_hz + 1e-6).astype(int)
     return select(recording, np.flatnonzero(np.diff(period, prepend=-1) > 0))
+
+
+def take(photographs: Photographs, indices: Int[np.ndarray, " m"]) -> Photographs:
+    """Some of the photographs, in the order given; the clock stays as it is."""
+    return photographs._replace(
+        t=photographs.t[indices],
+        rgb=photographs.rgb[indices],
+        T_world_cam=photographs.T_world_cam[indices],
+        files=tuple(photographs.files[i] for i in indices),
+    )
+
+
+def every(photographs: Photographs, n: int) -> Photographs:
+    """Every n-th photograph, beginning with the first.
+
+    ValueError for n below 1, DataError where fewer than two photographs would be left.
+    """
+    if n < 1:
+        raise ValueError(f"every: expected a step of at least 1, got {n}")
+    indices = np.arange(0, len(photographs.t), n)
+    if len(indices) < 2:
+        raise DataError(
+            f"{photographs.name}: expected at least 2 images, got {len(indices)}"
+            f" (every {n}. of {len(photographs.t)})"
+        )
+    return take(photographs, indices)

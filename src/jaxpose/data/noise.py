@@ -1,0 +1,64 @@
+"""Noise on known poses: smooth in time, as a drifting tracker errs, or of each view by itself.
+
+Both give T_noise in the frame of the camera it disturbs: T_init = T_true . T_noise.
+"""
+
+import math
+
+import numpy as np
+import scipy.linalg
+from jaxtyping import Float
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, Slerp
+
+
+def correlated(
+    t: Float[np.ndarray, " n"], *, translation: float, rotation_deg: float, seed: int, knots: int = 6
+) -> Float[np.ndarray, "n 4 4"]:
+    """Random deviations at `knots` equally spaced times from first to last, interpolated between them.
+
+    Cubic splines for translation, great arcs (slerp) for rotation. Each is then scaled so that the largest
+    deviation over the views is exactly `translation` [scene units] and `rotation_deg`; 0 gives none at all.
+    Rotation is scaled along its path of rotation vectors, which keeps the path continuous at any angle.
+    ValueError for times all alike, a negative size, an angle above 180 degrees, or fewer than 2 knots.
+    """
+    first, last = float(np.min(t)), float(np.max(t))
+    if not last > first:
+        raise ValueError(f"t: expected times that differ, got {len(t)} all at {first}")
+    if not (0 <= translation < math.inf and 0 <= rotation_deg <= 180 and knots >= 2):
+        raise ValueError(
+            "expected translation >= 0, rotation_deg from 0 to 180 and knots >= 2, "
+            f"got {translation}, {rotation_deg} and {knots}"
+        )
+    generator = np.random.default_rng(seed)
+    at = np.linspace(first, last, knots)
+    shift = CubicSpline(at, generator.normal(size=(knots, 3)))(t)
+    turn = generator.normal(size=(knots, 3))
+    # Within one radian of the identity arcs are unique and stay there, so no rotation vector jumps at pi.
+    turn /= np.linalg.norm(turn, axis=1).max()
+    turn = Slerp(at, Rotation.from_rotvec(turn))(np.clip(t, first, last)).as_rotvec()
+    T_noise = np.tile(np.eye(4), (len(t), 1, 1))
+    T_noise[:, :3, :3] = Rotation.from_rotvec(_scaled(turn, math.radians(rotation_deg))).as_matrix()
+    T_noise[:, :3, 3] = _scaled(shift, translation)
+    return T_noise
+
+
+def independent(n: int, sigma: float, seed: int) -> Float[np.ndarray, "n 4 4"]:
+    """BARF's noise: per view the exponential of a twist of N(0, sigma^2 I_6) [scene units and radians].
+
+    BARF itself puts it on the world's side of the pose, T_noise . T_true, where turning about the origin also
+    moves the camera. ValueError for a negative sigma.
+    """
+    if not 0 <= sigma < math.inf:
+        raise ValueError(f"sigma: expected 0 or more, got {sigma}")
+    rho, (x, y, z) = np.random.default_rng(seed).normal(scale=sigma, size=(2, 3, n))
+    twist = np.zeros((n, 4, 4))
+    twist[:, 2, 1], twist[:, 0, 2], twist[:, 1, 0] = x, y, z
+    twist[:, 1, 2], twist[:, 2, 0], twist[:, 0, 1] = -x, -y, -z
+    twist[:, :3, 3] = rho.T
+    return scipy.linalg.expm(twist)
+
+
+def _scaled(deviations: Float[np.ndarray, "n 3"], largest: float) -> Float[np.ndarray, "n 3"]:
+    """The deviations scaled so that the longest has the length asked for."""
+    return deviations * (largest / np.linalg.norm(deviations, axis=1).max())
