@@ -278,6 +278,7 @@ MIRROR = np.diag([1.0, 1, -1, 1]).tolist()
         (fewer(0), r"expected images beside it, got none of the 0"),
         (no_focal, r"transforms.json: expected a focal length, fl_x or camera_angle_x, got neither"),
         (spoil(fl_x=0), r"expected a focal length above 0 px, got 0"),
+        (spoil(camera_angle_x=0), r"expected a focal length above 0 px, got 0"),
         (spoil(fl_x="30"), r"expected a number for fl_x, got 30"),
         (spoil(cx=float("nan")), r"expected a number for cx, got nan"),
         (spoil(w=W + 1, h=H), rf"r_0.png: expected {W + 1}x{H}, as transforms.json states, got {W}x{H}"),

@@ -1,13 +1,11 @@
-"""Pose errors: gauge freedom, BARF's arithmetic again, degenerate cameras; photographs in part."""
+"""Pose errors: gauge freedom, BARF's arithmetic again, degenerate cameras."""
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxpose import metrics
-from jaxpose.camera import Camera
 from jaxpose.errors import DataError
-from jaxpose.recording import Photographs, every, take
 
 
 def random_poses(rng, count):
@@ -124,31 +122,3 @@ def test_an_estimate_all_in_one_place_keeps_its_scale_and_takes_the_mean_orienta
     mean = Rotation.from_matrix(reference[:, :3, :3]).mean()
     deviations = (mean.inv() * Rotation.from_matrix(reference[:, :3, :3])).magnitude()
     assert ours.rotation_deg == pytest.approx(np.degrees(deviations).mean(), rel=1e-6)
-
-
-def photographs(n):
-    return Photographs(
-        "p",
-        Camera(4.0, 4.0, 1.5, 1.5, 4, 4),
-        np.arange(n) / 10,
-        np.arange(n * 48, dtype=np.uint8).reshape(n, 4, 4, 3),
-        random_poses(np.random.default_rng(0), n),
-        2.0,
-        6.0,
-        "depth",
-        tuple(f"{i}.png" for i in range(n)),
-    )
-
-
-def test_every_nth_photograph():
-    whole = photographs(5)
-    half = every(whole, 2)
-    assert half.files == ("0.png", "2.png", "4.png")
-    np.testing.assert_array_equal(half.t, [0, 0.2, 0.4])
-    np.testing.assert_array_equal(half.rgb[1], whole.rgb[2])
-    np.testing.assert_array_equal(half.T_world_cam[2], whole.T_world_cam[4])
-    assert take(whole, np.array([3, 1])).files == ("3.png", "1.png")
-    with pytest.raises(DataError, match="p: expected at least 2 images, got 1"):
-        every(whole, 5)
-    with pytest.raises(ValueError, match="at least 1, got 0"):
-        every(whole, 0)

@@ -114,16 +114,17 @@ def _read(file: Path) -> _Source:
     t, stamped, note = _times(file, frames)
     order = np.argsort(t)
     frames, images = [frames[i] for i in order], [found[i][1] for i in order]
+    skipped = (f"{file.name}: {missing} frames without an image skipped",) if missing else ()
     return _Source(
-        file,
-        _intrinsics(file, content, frames),
-        _stated_depths(file, content),
-        [frame["file_path"] for frame in frames],
-        images,
-        _poses(file, frames),
-        t[order],
-        stamped,
-        (*([f"{file.name}: {missing} frames without an image skipped"] if missing else []), *note),
+        file=file,
+        intrinsics=_intrinsics(file, content, frames),
+        near_far=_stated_depths(file, content),
+        names=[frame["file_path"] for frame in frames],
+        images=images,
+        T_world_cam=_poses(file, frames),
+        t=t[order],
+        stamped=stamped,
+        notes=(*skipped, *note),
     )
 
 
@@ -202,13 +203,13 @@ def _camera(source: _Source) -> Camera:
     if "fl_x" in given:
         fx = given["fl_x"]
     elif "camera_angle_x" in given:
-        fx = 0.5 * width / math.tan(0.5 * given["camera_angle_x"])
+        fx = _focal(width, given["camera_angle_x"])
     else:
         raise DataError(f"{file}: expected a focal length, fl_x or camera_angle_x, got neither")
     if "fl_y" in given:
         fy = given["fl_y"]
     elif "camera_angle_y" in given and "fl_x" not in given:
-        fy = 0.5 * height / math.tan(0.5 * given["camera_angle_y"])
+        fy = _focal(height, given["camera_angle_y"])
     else:
         fy = fx
     if not (0 < fx < 1e3 * width and 0 < fy < 1e3 * width):
@@ -223,6 +224,11 @@ def _camera(source: _Source) -> Camera:
         height=height,
         distortion=lens if any(lens) else (),
     )
+
+
+def _focal(size: int, angle: float) -> float:
+    """The focal length [px] that sees `size` pixels within an angle [rad]; 0 for what is no such angle."""
+    return 0.5 * size / math.tan(0.5 * angle) if 0 < angle < math.pi else 0.0
 
 
 def _number(file: Path, entries: dict[str, Any], key: str) -> float:
