@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from jaxpose.data import llff
 from jaxpose.errors import DataError
 
-N = 21
+N = 29
 FULL = (320, 240)  # the original images, of which the folders hold smaller ones
 FOCAL = 300.0
 
@@ -82,10 +82,10 @@ def test_poses_follow_barf(tmp_path):
 
 def test_split_order_and_depths(tmp_path):
     train, held_out = llff.load(write(tmp_path))
-    assert (len(train.t), len(held_out.t)) == (19, 2)  # int(0.1 * 21)
-    assert held_out.files == ("images_4/IMG_4045.png", "images_4/IMG_4046.png")
-    np.testing.assert_array_equal(train.t, 4026 + np.arange(19))
-    assert held_out.rgb[1, 0, 0, 0] == 20
+    assert (len(train.t), len(held_out.t)) == (27, 2)  # int(0.1 * 29)
+    assert held_out.files == ("images_4/IMG_4053.png", "images_4/IMG_4054.png")
+    np.testing.assert_array_equal(train.t, 4026 + np.arange(27))
+    assert held_out.rgb[1, 0, 0, 0] == 28
     assert train.rgb[3, 0, 0, 0] == 3
     assert (train.near, train.spacing) == (1.0, "disparity")
     assert 1 / train.far == pytest.approx(1e-8)
@@ -129,8 +129,8 @@ def changed(row, column, value):
         (changed(4, 15, 0.0), "row 4: expected a near depth above 0 and a far one beyond it, got 0 and 104"),
         (changed(4, 14, 200.0), "row 4: expected one height, width and focal length for all views"),
         (rows()[:1], "poses_bounds.npy: expected at least 3 views, 2 and one held out, got 1"),
-        (rows()[:20], "images_4: expected 20 images, one for each row of poses_bounds.npy, got 21"),
-        (rows()[:, :16], "expected rows of 17 numbers, got float64 of shape (21, 16)"),
+        (rows()[:20], "images_4: expected 20 images, one for each row of poses_bounds.npy, got 29"),
+        (rows()[:, :16], "expected rows of 17 numbers, got float64 of shape (29, 16)"),
         (np.array([{"a": 1}]), "poses_bounds.npy: expected an array of numbers, got Object arrays cannot"),
     ],
 )
