@@ -279,9 +279,8 @@ def test_a_killed_run_resumed_has_the_numbers_of_a_whole_one(photograph, tmp_pat
         planar.run(planar.Config(out=out, **smoke), kill)
     assert not (out / "results.json").exists() and (out / "motions" / "00.json").exists()
     before = (out / "motions" / "00.json").stat().st_mtime_ns
-    planar.main(
-        ["--image", str(photograph), "--smoke", "--pose", "spline_reset", "--out", str(out), "--resume"]
-    )
+    again = ["--image", str(photograph), "--smoke", "--pose", "spline_reset", "--out", str(out), "--resume"]
+    planar.main(again)
     assert (out / "motions" / "00.json").stat().st_mtime_ns == before
     said = capsys.readouterr()
     assert "spline_reset 2/2" in said.err and "spline_reset 1/2" not in said.err
