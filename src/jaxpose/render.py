@@ -6,13 +6,14 @@ the weights given to `render_ray`: a density (NeRF), an occupancy (NICE-SLAM) or
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PRNGKeyArray
 
 Query = Callable[[Float[Array, "3"], Float[Array, "3"]], tuple[Float[Array, ""], Float[Array, "3"]]]
+Spacing = Literal["depth", "disparity"]
 Weights = Callable[[Float[Array, " s"], Float[Array, " s"]], Float[Array, " s"]]
 
 
@@ -35,12 +36,35 @@ class Rendered(NamedTuple):
     opacity: Float[Array, "*n"]
 
 
-def density_weights(density: Float[Array, " s"], depth: Float[Array, " s"]) -> Float[Array, " s"]:
-    """Probability that the ray ends at each sample, from volume densities per unit of depth (NeRF).
+def sample_depths(
+    key: PRNGKeyArray | None,
+    near: float | Float[Array, ""],
+    far: float | Float[Array, ""],
+    samples: int,
+    *,
+    spacing: Spacing = "depth",
+) -> Float[Array, " samples"]:
+    """Increasing depths, one in each of `samples` equal parts: drawn, or the middle without a key.
 
-    The last interval has no end, as in NeRF.
+    The parts are equal in depth or in disparity, 1 / depth; in disparity `far` may be infinite. With a key
+    for every ray each has its own depths, with one for all they share them. As in BARF (PEERS B1).
     """
-    tau = density * jnp.append(jnp.diff(depth), jnp.asarray(1e10, depth.dtype))
+    within = jnp.full(samples, 0.5) if key is None else jax.random.uniform(key, (samples,))
+    share = (jnp.arange(samples, dtype=within.dtype) + within) / samples
+    if spacing == "depth":
+        return near + (far - near) * share
+    return 1 / jnp.maximum((1 - share) / near + share / far, 1e-8)
+
+
+def density_weights(
+    density: Float[Array, " s"], depth: Float[Array, " s"], *, length: float | Float[Array, ""] = 1.0
+) -> Float[Array, " s"]:
+    """Probability that the ray ends at each sample, from volume densities per unit of length (NeRF).
+
+    `length` is that of one unit of depth along the ray: the norm of its direction, where depth is z-depth.
+    The last interval has no end, as in NeRF: what stands at the last sample closes the ray.
+    """
+    tau = density * (jnp.append(jnp.diff(depth), jnp.asarray(1e10, depth.dtype)) * length)
     return -jnp.expm1(-tau) * jnp.exp(-_before(tau))
 
 
