@@ -8,7 +8,7 @@ import pytest
 import jaxpose
 
 LAYERS = (
-    "errors se3 camera nn fields motion scenes render imu events losses metrics train recording slam data io"
+    "errors se3 camera nn fields motion scenes render imu events losses metrics train recording nerf slam data io"
     " plots experiments cli"
 ).split()
 BESIDE = {

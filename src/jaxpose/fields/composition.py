@@ -4,6 +4,8 @@ Where no parameters are added these take and return pose functions `t -> T`, not
 may be traced: the next frame's reference then needs no recompilation.
 """
 
+from typing import Literal
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -12,9 +14,15 @@ from jaxpose import se3
 from jaxpose.fields.base import PoseField, PoseFn
 
 
-def refine(field: PoseField, initial: PoseFn) -> PoseField:
-    """The field as a correction on the body side of known poses: T_init(t) . P(t)."""
-    return PoseField(field.init, lambda params, t: se3.compose(initial(t), field.pose(params, t)))
+def refine(field: PoseField, initial: PoseFn, *, side: Literal["body", "world"] = "body") -> PoseField:
+    """The field as a correction of known poses: T_init . P on the body's side, P . T_init on the world's.
+
+    On the world's side a rotation turns the body about the world's origin, where NeRF puts the object; this
+    is the supplement's T_c,w = T_init . T_refine, whose poses are world-to-camera, with P = T_refine^-1.
+    """
+    if side == "body":
+        return PoseField(field.init, lambda params, t: se3.compose(initial(t), field.pose(params, t)))
+    return PoseField(field.init, lambda params, t: se3.compose(field.pose(params, t), initial(t)))
 
 
 def intrinsic(outer: PoseField, inner: PoseField) -> PoseField:
