@@ -1,0 +1,257 @@
+"""NeRF from noisy or unknown poses: a scene and the cameras' trajectory optimised together from photographs.
+
+Without options: 100 views of an object on an orbit made on the fly, poses disturbed by smooth noise of 20%
+of the orbit's diameter, PoseNet against it, a run folder under outputs/noisy_nerf. `--data DIR` reads
+photographs with poses (Blender, nerfstudio, instant-ngp, LLFF). `--study fields` puts all pose fields side
+by side.
+"""
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import imageio.v3 as imageio
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from jaxpose import io, io_checkpoint, metrics, nerf, plots_nerf
+from jaxpose.data import blender
+from jaxpose.errors import DataError
+from jaxpose.experiments import command
+from jaxpose.experiments.noisy_nerf_measure import PROTOCOL, Measured, measure
+from jaxpose.experiments.noisy_nerf_options import CHUNK, ORBIT, Config, Problem, decisive, load
+from jaxpose.experiments.noisy_nerf_report import Progress, progress_bar, report, table
+from jaxpose.experiments.noisy_nerf_setup import Setup, build, describe, splined
+from jaxpose.experiments.noisy_nerf_studies import STUDIES
+from jaxpose.io_transforms import write_transforms
+from jaxpose.nerf import State
+from jaxpose.plots_nerf import History
+
+_SAVE_EVERY_S = 30.0
+_COLUMNS = ("step", "loss", "psnr", "rotation_deg", "translation", "seconds")
+
+OnProgress = Callable[[Progress], None]
+
+
+class Outcome(NamedTuple):
+    """Where a run was written, and its results; those of a study under `runs`, by label."""
+
+    folder: Path
+    results: dict[str, Any]
+
+
+class Trained(NamedTuple):
+    """Where a training stands, and how it went there: rows of step, loss, PSNR, errors and seconds."""
+
+    state: State
+    history: Float[np.ndarray, "c 6"]  # NaN where the training has not been
+
+
+def run(config: Config, on_progress: OnProgress | None = None) -> Outcome:
+    """Train, measure and write the run folder; `resume` goes on where a killed run stopped.
+
+    Raises DataError or OSError for what cannot be used; then no folder is left behind.
+    """
+    started = time.perf_counter()
+    problem = load(config)
+    folder = io.run_folder("noisy_nerf", name=config.name, out=config.out)
+    if config.study is None:
+        return Outcome(folder, _single(config, problem, folder, on_progress, ""))
+    results, histories = {}, {}
+    for label, changed in STUDIES[config.study](config).items():
+        inner = folder / label
+        inner.mkdir(exist_ok=True)
+        results[label] = _single(replace(changed, study=None), problem, inner, on_progress, label)
+        histories[label] = _history(np.array(results[label]["history"], float))
+    whole = {
+        "experiment": "noisy_nerf",
+        "study": config.study,
+        "seed": config.seed,
+        "smoke": config.smoke,
+        "runs": results,
+        "versions": io.versions(),
+        "wall_s": time.perf_counter() - started,
+        "peak_rss_bytes": io.peak_rss_bytes(),
+    }
+    plots_nerf.curves(folder / "curves.png", histories, f"{_title(problem)}: {config.study}")
+    io.write_json(folder / "config.json", config)
+    io.write_text(folder / "table.md", table(results) + "\n")
+    io.write_json(folder / "results.json", whole)
+    return Outcome(folder, whole)
+
+
+def train(
+    config: Config,
+    problem: Problem,
+    setup: Setup,
+    checkpoint: Path,
+    on_progress: OnProgress | None,
+    label: str,
+) -> Trained:
+    """Train to the end, from the checkpoint if there is one, and keep one as it goes."""
+    trainer = nerf.trainer(
+        setup.scene,
+        setup.field,
+        problem.train.camera,
+        setup.depths,
+        setup.scene_rates,
+        setup.pose_rates,
+        setup.train,
+    )
+    steps = setup.train.steps
+    trained = Trained(
+        trainer.start(jax.random.key(config.seed)), np.full((steps // CHUNK, len(_COLUMNS)), np.nan)
+    )
+    if checkpoint.exists():
+        trained = io_checkpoint.load(checkpoint, trained)
+    state, history = trained.state, trained.history.copy()
+    poses = pose_reader(setup)
+    done = int(state.step)
+    before = history[done // CHUNK - 1, -1] if done else 0.0
+    started = saved = time.perf_counter()
+    for first in range(done, steps, CHUNK):
+        state, losses = trainer.advance(state, setup.views, CHUNK)
+        if config.pose == "spline_reset":
+            smooth = splined(state.pose, problem.train.t, config.spline_knots, config.spline_smoothing)
+            state = state._replace(pose=smooth)
+        loss = float(losses.mean())
+        if not np.isfinite(loss):
+            raise DataError(f"step {first + CHUNK}: expected a finite loss, got {loss}")
+        errors = metrics.pose_errors(poses(state.pose), problem.train.T_world_cam)
+        now = time.perf_counter()
+        psnr = -10 * np.log10(loss)
+        row = (first + CHUNK, loss, psnr, errors.rotation_deg, errors.translation, before + now - started)
+        history[first // CHUNK] = row
+        if now - saved > _SAVE_EVERY_S or first + CHUNK == steps:
+            io_checkpoint.save(checkpoint, Trained(state, history))
+            saved = now
+        if on_progress is not None:
+            on_progress(Progress(label, steps, problem.extent, *row[:-1]))
+    return Trained(state, history)
+
+
+def pose_reader(setup: Setup) -> Callable[[Any], Float[np.ndarray, "n 4 4"]]:
+    """Camera-to-world poses of the training images, from the parameters of the field."""
+    compiled = jax.jit(lambda params: jax.vmap(setup.field.pose, (None, 0))(params, setup.views.t))
+    return lambda params: np.asarray(compiled(params), np.float64)
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """The command: `python -m jaxpose.experiments.noisy_nerf`."""
+    config = command.parse("noisy_nerf", Config, __doc__, args)
+    command.guarded("noisy_nerf", lambda: report(*run(config, progress_bar())))
+
+
+def _single(
+    config: Config, problem: Problem, folder: Path, on_progress: OnProgress | None, label: str
+) -> dict[str, Any]:
+    """One training, measured and written; what a killed or finished run has left is used with `resume`."""
+    started = time.perf_counter()
+    checkpoint, finished = folder / "checkpoint.npz", folder / "results.json"
+    _prepare(folder, config)
+    if finished.exists():
+        return json.loads(finished.read_text())
+    setup = build(config, problem)
+    trained = train(config, problem, setup, checkpoint, on_progress, label)
+    T_world_cam = pose_reader(setup)(trained.state.pose)
+    measured = measure(config, problem, setup, trained.state, T_world_cam)
+    _draw(folder, config, problem, measured, trained)
+    _write_poses(folder, config, problem, measured)
+    seconds = float(trained.history[-1, -1])
+    results = {
+        "experiment": "noisy_nerf",
+        "data": problem.about,
+        "training": describe(config, setup),
+        "protocol": PROTOCOL,
+        "seed": config.seed,
+        "smoke": config.smoke,
+        **measured.numbers,
+        "train_s": seconds,
+        "seconds_per_step": seconds / setup.train.steps,
+        "history_columns": _COLUMNS,
+        "history": trained.history,
+        "versions": io.versions(),
+        "wall_s": time.perf_counter() - started,
+        "peak_rss_bytes": io.peak_rss_bytes(),
+    }
+    io.write_json(finished, results)  # last: with it the run counts as finished
+    return results
+
+
+def _prepare(folder: Path, config: Config) -> None:
+    """Leave in the folder the config, and earlier results only if they are this run's and to be kept."""
+    stored = folder / "settings.json"
+    settings = json.loads(json.dumps(decisive(config), default=_named))
+    if config.resume and stored.exists():
+        before = json.loads(stored.read_text())
+        for name, value in settings.items():
+            if before.get(name) != value:
+                option = name.replace("_", "-")
+                raise DataError(f"{folder}: expected --{option} {before.get(name)}, as it began, got {value}")
+    else:
+        for name in ("checkpoint.npz", "results.json"):
+            (folder / name).unlink(missing_ok=True)
+        io.write_json(stored, settings)
+    io.write_json(folder / "config.json", config)
+
+
+def _named(value: Any) -> Any:
+    """A path as text, a nested config as a dict."""
+    return str(value) if isinstance(value, Path) else vars(value)
+
+
+def _draw(folder: Path, config: Config, problem: Problem, measured: Measured, trained: Trained) -> None:
+    numbers, title = measured.numbers, _title(problem)
+    found = (
+        f"{config.pose}: rotation {numbers['start']['rotation_error_deg']:.2f} to "
+        f"{numbers['rotation_error_deg']:.3f} deg, translation "
+        f"{numbers['start']['translation_error_percent']:.2f} to "
+        f"{numbers['translation_error_percent']:.3f}% of the cameras' extent"
+    )
+    truth = problem.train.T_world_cam
+    plots_nerf.cameras(
+        folder / "cameras.png", truth, measured.T_start, measured.T_estimate, f"{title}\n{found}"
+    )
+    psnr = f"{config.pose}, held-out PSNR {numbers['psnr']:.2f} dB"
+    plots_nerf.held_out(folder / "held_out.png", measured.views, f"{title}: {psnr}")
+    plots_nerf.curves(folder / "curves.png", {config.pose: _history(trained.history)}, f"{title}\n{found}")
+
+
+def _write_poses(folder: Path, config: Config, problem: Problem, measured: Measured) -> None:
+    """The refined poses, aligned with the data's own world, as a trajectory and as transforms.json."""
+    photographs = problem.train
+    refined = photographs._replace(T_world_cam=measured.T_estimate)
+    io.write_tum(folder / "trajectory.txt", io.Trajectory(photographs.t, measured.T_estimate))
+    io.write_tum(folder / "reference.txt", io.Trajectory(photographs.t, photographs.T_world_cam))
+    with io.atomic(folder / "start.npz") as temporary:
+        np.savez(temporary, t=photographs.t, T_world_cam=problem.T_start)
+    if config.data == ORBIT:  # its images are on no disk yet
+        for part in (photographs, problem.held_out):
+            for name, rgb in zip(part.files, part.rgb, strict=True):
+                (folder / name).parent.mkdir(exist_ok=True)
+                imageio.imwrite(folder / name, rgb)
+        write_transforms(folder / "transforms_test.json", problem.held_out)
+        write_transforms(folder / "transforms_train.json", refined)
+    elif (config.data / "poses_bounds.npy").is_file():
+        write_transforms(folder / "transforms.json", refined)
+    else:
+        write_transforms(folder / "transforms.json", refined, source=blender.transforms_file(config.data))
+
+
+def _title(problem: Problem) -> str:
+    width, height = problem.about["size"]
+    return f"{problem.about['data']}, {problem.about['images']} views of {width}x{height}, noise " + str(
+        problem.about["noise"]
+    )
+
+
+def _history(rows: Float[np.ndarray, "c 6"]) -> History:
+    return History(rows[:, 0].astype(int), *rows[:, 1:5].T)
+
+
+if __name__ == "__main__":
+    main()

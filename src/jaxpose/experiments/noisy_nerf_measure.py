@@ -1,0 +1,132 @@
+"""How good a training is: pose errors against the truth, held-out views with and without settling them."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, PRNGKeyArray
+
+from jaxpose import metrics, nerf
+from jaxpose.experiments.noisy_nerf_options import Config, Problem
+from jaxpose.experiments.noisy_nerf_setup import Setup
+from jaxpose.fields import set_progress
+from jaxpose.metrics import PoseErrors
+from jaxpose.metrics_image import lpips, ssim
+from jaxpose.nerf import State, Viewer
+from jaxpose.plots_nerf import HeldOut
+
+PROTOCOL = {
+    "alignment": "similarity that maps estimated camera centres to the true ones (scale: ratio of spreads), "
+    "as in BARF",
+    "rotation_error_deg": "angle to the true orientation after alignment, mean over the training views",
+    "translation_error": "distance of world-to-camera translation vectors after alignment, mean over the "
+    "training views, as BARF defines it [scene units]",
+    "centre_error": "distance of camera centres after alignment, mean over training views [scene units]",
+    "psnr, ssim, lpips": "mean over the held-out views, their true poses brought into the estimate's frame "
+    "by the alignment; settled: after test-time optimisation of each pose on its photograph",
+}
+
+
+class Measured(NamedTuple):
+    """The numbers, the held-out views to draw, and poses aligned with the truth."""
+
+    numbers: dict[str, Any]
+    views: list[HeldOut]
+    T_start: Float[np.ndarray, "n 4 4"]
+    T_estimate: Float[np.ndarray, "n 4 4"]
+
+
+def pose_numbers(errors: PoseErrors, extent: float) -> dict[str, float]:
+    """Means of pose errors; translations also in percent of the cameras' extent."""
+    return {
+        "rotation_error_deg": errors.rotation_deg,
+        "translation_error": errors.translation,
+        "translation_error_percent": 100 * errors.translation / extent,
+        "centre_error": errors.centre,
+        "centre_error_percent": 100 * errors.centre / extent,
+    }
+
+
+def measure(
+    config: Config, problem: Problem, setup: Setup, state: State, T_world_cam: Float[np.ndarray, "n 4 4"]
+) -> Measured:
+    """Errors of the trained poses, and of what the scene shows from held-out ones."""
+    truth = problem.train.T_world_cam
+    errors = metrics.pose_errors(T_world_cam, truth)
+    at_start = metrics.pose_errors(problem.T_start, truth)
+    to_estimate = metrics.procrustes(truth, T_world_cam)
+    viewer = nerf.viewer(
+        setup.scene,
+        problem.train.camera,
+        setup.depths,
+        setup.train,
+        settle_steps=config.settle_steps,
+        settle_rate=setup.settle_rate,
+    )
+    scene = set_progress(state.scene, jnp.ones(()))
+    keys = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), 1), len(problem.held_out.t))
+    as_aligned, as_settled, views = [], [], []
+    for index, key in enumerate(keys):
+        pose = metrics.align(to_estimate, problem.held_out.T_world_cam[index : index + 1])[0]
+        image, view = _seen(viewer, scene, problem, index, pose)
+        as_aligned.append(image)
+        views.append(view)
+        if config.settle_steps:
+            as_settled.append(_settled(viewer, scene, problem, index, pose, key))
+    numbers = {
+        **pose_numbers(errors, problem.extent),
+        **_means(as_aligned),
+        "settled": _means(as_settled) if as_settled else None,
+        "start": pose_numbers(at_start, problem.extent),
+        "largest": {
+            "rotation_error_deg": np.nanmax(errors.rotation_errors_deg),
+            "translation_error": np.nanmax(errors.translation_errors),
+        },
+        "held_out": as_aligned,
+    }
+    return Measured(
+        numbers,
+        views,
+        metrics.align(at_start.alignment, problem.T_start),
+        metrics.align(errors.alignment, T_world_cam),
+    )
+
+
+def _settled(
+    viewer: Viewer,
+    scene: Any,
+    problem: Problem,
+    index: int,
+    pose: Float[np.ndarray, "4 4"],
+    key: PRNGKeyArray,
+) -> dict[str, float | None]:
+    rgb = jnp.asarray(problem.held_out.rgb[index])
+    moved = viewer.settle(scene, jnp.asarray(pose, jnp.float32), rgb, key)
+    return _seen(viewer, scene, problem, index, np.asarray(moved, np.float64))[0]
+
+
+def _seen(
+    viewer: Viewer, scene: Any, problem: Problem, index: int, pose: Float[np.ndarray, "4 4"]
+) -> tuple[dict[str, float | None], HeldOut]:
+    """A held-out photograph rendered from a pose: how alike they are, and both."""
+    rgb, depth = viewer.image(scene, jnp.asarray(pose, jnp.float32))
+    rendered = np.clip(np.asarray(rgb, np.float64), 0, 1)
+    photograph = problem.held_out.rgb[index]
+    truth = photograph / 255
+    numbers = {
+        "psnr": metrics.psnr(rendered, truth),
+        "ssim": ssim(rendered, truth),
+        "lpips": lpips(rendered, truth),
+    }
+    label = problem.held_out.files[index]
+    return numbers, HeldOut(label, photograph, rendered, np.asarray(depth, np.float64))
+
+
+def _means(views: list[dict[str, float | None]]) -> dict[str, float | None]:
+    """Means over views; None where a number could not be had."""
+    columns = {name: [view[name] for view in views] for name in views[0]}
+    return {
+        name: None if None in values else float(np.mean([v for v in values if v is not None]))
+        for name, values in columns.items()
+    }

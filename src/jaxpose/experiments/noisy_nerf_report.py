@@ -1,0 +1,117 @@
+"""What the noisy-pose experiment says: a bar while it trains, then numbers with their protocol."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from tqdm import tqdm
+
+_COLUMNS: tuple[str, ...] = (
+    "run", "RE [deg]", "TE [units]", "TE [%]", "centres [%]", "PSNR [dB]", "SSIM", "LPIPS", "train [s]",
+)  # fmt: skip
+
+
+class Progress(NamedTuple):
+    """Where a training is: after `step` of `steps`."""
+
+    label: str
+    steps: int
+    extent: float  # [scene units]
+    step: int
+    loss: float
+    psnr: float  # [dB] of the training rays
+    rotation_deg: float
+    translation: float  # [scene units]
+
+
+def progress_bar() -> Callable[[Progress], None]:
+    """A callback for `run` that draws a bar on stderr for each training."""
+    bar: tqdm | None = None
+    done = 0
+
+    def on_progress(progress: Progress) -> None:
+        nonlocal bar, done
+        if bar is None:
+            done = 0
+            bar = tqdm(total=progress.steps, desc=progress.label or "training", unit="step", file=sys.stderr)
+        bar.set_postfix(
+            {
+                "loss": f"{progress.loss:.5f}",
+                "PSNR": f"{progress.psnr:.2f} dB",
+                "off": f"{progress.rotation_deg:.2f} deg {100 * progress.translation / progress.extent:.2f}%",
+            },
+            refresh=False,
+        )
+        bar.update(progress.step - done)
+        done = progress.step
+        if progress.step == progress.steps:
+            bar.close()
+            bar = None
+
+    return on_progress
+
+
+def table(runs: dict[str, dict[str, Any]]) -> str:
+    """Results side by side, in Markdown."""
+    rows = [_COLUMNS] + [
+        (
+            label,
+            f"{run['rotation_error_deg']:.3f}",
+            f"{run['translation_error']:.4f}",
+            f"{run['translation_error_percent']:.3f}",
+            f"{run['centre_error_percent']:.3f}",
+            _number(run["psnr"], 2),
+            _number(run["ssim"], 3),
+            _number(run["lpips"], 3),
+            f"{run['train_s']:.0f}",
+        )
+        for label, run in runs.items()
+    ]
+    widths = [max(len(row[k]) for row in rows) for k in range(len(_COLUMNS))]
+    lines = [
+        "| " + " | ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) + " |"
+        for row in rows
+    ]
+    lines.insert(1, "|" + "|".join("-" * (width + 2) for width in widths) + "|")
+    return "\n".join(lines)
+
+
+def report(folder: Path, results: dict[str, Any]) -> str:
+    """The numbers of a run with their protocol, and where everything is."""
+    runs = results.get("runs") or {results["training"]["pose"] if "training" in results else "": results}
+    one = next(iter(runs.values()))
+    data, training, start, protocol = one["data"], one["training"], one["start"], one["protocol"]
+    width, height = data["size"]
+    smoke = "  SMOKE RUN, the numbers mean nothing" if results["smoke"] else ""
+    settled = {label: run["settled"] for label, run in runs.items() if run["settled"]}
+    lines = [
+        f"noisy_nerf: {data['data']}, {data['images']} views of {width}x{height}, "
+        f"preset {training['preset']}, {training['steps']} steps of {training['rays']} rays x "
+        f"{training['samples']} samples, seed {results['seed']}{smoke}",
+        *(f"  note         {note}" for note in data["notes"]),
+        f"  noise        {data['noise']}:",
+        f"               {start['rotation_error_deg']:.2f} deg, {start['translation_error_percent']:.2f}% "
+        f"(centres {start['centre_error_percent']:.2f}%) at the start",
+        "",
+        table(runs),
+        "",
+        f"  RE           {protocol['rotation_error_deg']}",
+        f"  TE           {protocol['translation_error']}; in percent of the cameras' extent, "
+        f"{data['extent']:.3g}",
+        f"  alignment    {protocol['alignment']}",
+        f"  PSNR ...     {protocol['psnr, ssim, lpips']}",
+        *(
+            f"  settled      {label}: PSNR {run['psnr']:.2f} dB, SSIM {run['ssim']:.3f}, "
+            f"LPIPS {_number(run['lpips'], 3)}"
+            for label, run in settled.items()
+        ),
+        f"  cost         {results['wall_s']:.0f} s in all, "
+        f"{results['peak_rss_bytes'] / 2**30:.2f} GiB of memory at most",
+        f"  written to   {folder}",
+    ]
+    return "\n".join(lines)
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "n/a" if value is None else f"{value:.{digits}f}"

@@ -1,0 +1,138 @@
+"""What is trained in the noisy-pose experiment: scene, pose field, their rates, by preset and name."""
+
+import warnings
+from dataclasses import asdict, replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.interpolate import make_splrep
+
+from jaxpose import fields
+from jaxpose.experiments.noisy_nerf_options import CHUNK, Config, Problem
+from jaxpose.fields import PoseField, PoseNetConfig
+from jaxpose.nerf import Depths, Rate, TrainConfig, Views
+from jaxpose.scenes import NerfConfig, SceneField, nerf
+
+_FAST_SCENE = NerfConfig(layers=4, width=96, skip=2, colour_width=48, octaves=8, window=(0.2, 0.65))
+_SMOKE_SCENE = NerfConfig(layers=2, width=16, skip=1, colour_width=8, octaves=4, window=(0.1, 0.5))
+_FAST = TrainConfig(steps=3000, rays=1024, samples=32, chunk=64)
+_PAPER = TrainConfig(steps=200_000, rays=4096, samples=128, chunk=32)
+_SMOKE = TrainConfig(steps=CHUNK, rays=64, samples=8, chunk=32)
+# In short trainings on poses far off: first a blurred scene forms, then the cameras move to where it is seen,
+# then they turn. Free at once, they run after a scene that does not exist yet, and do not come back.
+_SHIFT_FROM, _TURN_FROM = 0.05, 0.1  # shares of the training
+_BARF_SETTLE = {"depth": 1e-3, "disparity": 3e-3}  # BARF's rate of test-time poses, Blender and LLFF
+
+
+class Setup(NamedTuple):
+    """A scene and a pose field (camera-to-world), and how to train them."""
+
+    scene: SceneField
+    field: PoseField
+    scene_rates: Rate
+    pose_rates: Any
+    train: TrainConfig
+    depths: Depths
+    views: Views
+    settle_rate: float
+
+
+def build(config: Config, problem: Problem) -> Setup:
+    """Scene, pose field and rates that the config names, for these photographs."""
+    photographs, paper = problem.train, config.preset == "paper"
+    barf = photographs.spacing
+    if config.smoke:
+        scene, train = nerf(_SMOKE_SCENE), _SMOKE
+    else:
+        scene, train = (nerf(), _PAPER) if paper else (nerf(_FAST_SCENE), _FAST)
+        train = replace(train, steps=config.steps or train.steps, rays=config.rays or train.rays)
+    if not paper:
+        scene_rates = Rate(1e-3, 1e-4)
+    else:
+        scene_rates = Rate(5e-4, 1e-4) if barf == "depth" else Rate(1e-3, 1e-4)
+    t = jnp.asarray(photographs.t, jnp.float32)
+    field, rates = _field(config, problem)
+    initial = fields.stamped(t, jnp.asarray(problem.T_start, jnp.float32))
+    return Setup(
+        scene,
+        fields.refine(field, initial, side="world" if config.side == "world" else "body"),
+        scene_rates,
+        rates,
+        train,
+        Depths(photographs.near, photographs.far, photographs.spacing),
+        Views(t, jnp.asarray(photographs.rgb)),
+        _BARF_SETTLE[barf],
+    )
+
+
+def splined(
+    params: Float[Array, "n 6"], t: Float[np.ndarray, " n"], knots: int, smoothing: float
+) -> Float[Array, "n 6"]:
+    """A table reset to scipy's cubic smoothing spline of each of its six columns, the paper's "B-spline".
+
+    The spline has the fewest knots, and at most `knots` inside the span, with which its squared residuals sum
+    up to `smoothing`; where that many do not reach it, they are all used.
+    """
+    degree = 3
+    most = min(knots + 2 * (degree + 1), len(t) + degree + 1)  # counting those at the ends
+    values = np.asarray(params, np.float64)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # that the knots do not reach the smoothing
+        columns = [
+            make_splrep(t, column, k=degree, s=smoothing, nest=most)(t)  # pyright: ignore[reportArgumentType]
+            for column in values.T
+        ]
+    return jnp.asarray(np.stack(columns, axis=-1), params.dtype)
+
+
+def describe(config: Config, setup: Setup) -> dict[str, Any]:
+    """The settings of a training, in words and numbers."""
+    train = asdict(setup.train)
+    del train["chunk"]
+    plain = lambda rates: jax.tree.map(
+        lambda rate: [np.unique(part).tolist() for part in rate],
+        rates,
+        is_leaf=lambda x: isinstance(x, Rate),
+    )
+    return {
+        "pose": config.pose,
+        "preset": config.preset,
+        "side": config.side,
+        **train,
+        "net": asdict(config.net) if config.pose == "posenet" else None,
+        "spline_knots": config.spline_knots if "spline" in config.pose else None,
+        "spline_smoothing": config.spline_smoothing if config.pose == "spline_reset" else None,
+        "rates": {"first, last, start": {"scene": plain(setup.scene_rates), "pose": plain(setup.pose_rates)}},
+    }
+
+
+def _field(config: Config, problem: Problem) -> tuple[PoseField, Any]:
+    """The correction of the poses by itself, and its rates."""
+    photographs, paper = problem.train, config.preset == "paper"
+    span = (float(photographs.t[0]), float(photographs.t[-1]))
+    starts = (0.0, 0.0) if paper else (_SHIFT_FROM, _TURN_FROM)
+    if config.pose == "posenet":
+        # tanh bounds the translation: half the cameras' extent, or, where nothing is known of them, the
+        # nearest depth, which is the unit of LLFF's scenes.
+        scale = photographs.near if config.noise == "unknown" else problem.extent / 2
+        net = replace(config.net, layers=2, width=32) if config.smoke else config.net
+        field = fields.posenet(PoseNetConfig(span=span, translation_scale=scale, **asdict(net)))
+        shift, turn = ((1e-3, 1e-5), (2e-4, 1e-6)) if paper else ((3e-4, 1e-5), (2e-4, 5e-6))
+        rates = {"translation": Rate(*shift, starts[0]), "rotation": Rate(*turn, starts[1])}
+        if config.net.coupled:
+            rates = {"coupled": rates["rotation"]}
+        return field, rates if config.net.window is None else rates | {"progress": Rate(1.0, 1.0)}
+    first, last = (3e-3 if photographs.spacing == "disparity" else 1e-3, 1e-5) if paper else (3e-3, 1e-4)
+    if config.pose == "bspline":
+        field, columns = fields.bspline(span, config.spline_knots), (3, 4)
+    else:
+        field, columns = fields.table(photographs.t), (3, 3)
+    return field, Rate(first, last, np.repeat(starts, columns)[None])
+
+
+def resets(config: Config) -> bool:
+    """Whether the table is reset to a spline between chunks of steps."""
+    return config.pose == "spline_reset"
