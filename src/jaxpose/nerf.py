@@ -244,4 +244,5 @@ def _is_rate(x: Any) -> bool:
 
 def _rate(rate: Rate, progress: Float[Array, ""]) -> Float[Array, "*n"]:
     first, last, start = (jnp.asarray(x, progress.dtype) for x in rate)
-    return jnp.where(progress >= start, first * (last / first) ** progress, 0)
+    # Not first (last / first)^progress: a rate of zero keeps its parameters at rest.
+    return jnp.where(progress >= start, first ** (1 - progress) * last**progress, 0)

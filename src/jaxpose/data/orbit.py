@@ -76,10 +76,11 @@ def _photograph(
     camera: Camera, T_world_cam: Float[Array, "4 4"], paint: Float[Array, "6"]
 ) -> UInt8[Array, "h w 3"]:
     """One image; every pixel is the mean over a grid of rays in it, against white."""
-    offsets = (jnp.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5
-    x = (jnp.arange(camera.width)[:, None] + offsets).ravel()
-    y = (jnp.arange(camera.height)[:, None] + offsets).ravel()
-    direction = pixel_direction(camera, jnp.stack(jnp.meshgrid(x, y), axis=-1).reshape(-1, 2))
+    offsets = (np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5
+    x = (np.arange(camera.width)[:, None] + offsets).ravel()
+    y = (np.arange(camera.height)[:, None] + offsets).ravel()
+    pixels = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    direction = pixel_direction(camera, jnp.asarray(pixels, jnp.float32))
     direction = jnp.matmul(direction, T_world_cam[:3, :3].T, precision="highest")
     direction = direction / jnp.linalg.norm(direction, axis=-1, keepdims=True)
     rgb = jax.vmap(partial(_trace, paint, T_world_cam[:3, 3]))(direction)

@@ -57,7 +57,7 @@ class Config:
     image_width: int | None = None  # [px] images are reduced to; None: 100, with preset paper 400
     orbit_views: int = 100
     seed: int = 0  # of the noise, the network's start, the rays
-    steps: int | None = None  # None: 3000, with preset paper 200,000
+    steps: int | None = None  # None: 5000, with preset paper 200,000
     rays: int | None = None  # per step; None: 1024, with preset paper 4096
     net: NetConfig = NetConfig()
     spline_knots: int = 25  # of both splines
@@ -138,6 +138,11 @@ def _photographs(config: Config) -> tuple[Photographs, Photographs]:
         raise DataError(f"{config.data}: expected a folder of photographs, or orbit, got nothing")
     if (config.data / "poses_bounds.npy").is_file():
         train, held_out = llff.load(config.data, width=width)
+    elif config.data.is_dir() and not any(config.data.glob("transforms*.json")):
+        raise DataError(
+            f"{config.data}: expected transforms_train.json or transforms.json (Blender, nerfstudio, "
+            "instant-ngp) or poses_bounds.npy (LLFF), got none of them"
+        )
     else:
         train, held_out = blender.load(config.data, width=width)
     if config.smoke:

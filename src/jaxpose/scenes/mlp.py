@@ -25,6 +25,9 @@ class NerfConfig:
     direction_octaves: int = 4
     # Coarse-to-fine on both encodings, as fractions of the training; None: all bands from the start.
     window: tuple[float, float] | None = (0.1, 0.5)
+    # Whether the weights of the encodings' bands start at zero. A band that opens is then silent at first; in
+    # a short training, which has no time to get used to it, it would else be noise that poses run after.
+    quiet: bool = False
 
     def __post_init__(self):
         if (
@@ -48,6 +51,9 @@ def nerf(config: NerfConfig = NerfConfig()) -> SceneField:  # noqa: B008 - froze
     def init(key):
         keys = dict(zip(sizes, jax.random.split(key, len(sizes)), strict=True))
         params: dict = {name: _draw(keys[name], *size) for name, size in sizes.items()}
+        if config.quiet:
+            for name, bands in _bands(config).items():
+                params[name]["kernel"] = params[name]["kernel"].at[bands].set(0)
         return params if config.window is None else params | {"progress": jnp.zeros(())}
 
     def query(params, point, direction):
@@ -99,6 +105,15 @@ def _sizes(config: NerfConfig) -> dict[str, tuple[int, int, float]]:
         "colour_0": (width + seen_along, config.colour_width, _RELU_GAIN),
         "colour_1": (config.colour_width, 3, 1.0),
     }
+
+
+def _bands(config: NerfConfig) -> dict[str, slice]:
+    """Rows of kernels that see bands of an encoding, by layer."""
+    bands, along = 6 * config.octaves, 6 * config.direction_octaves
+    rows = {"layer_0": slice(3, 3 + bands), "colour_0": slice(config.width + 3, config.width + 3 + along)}
+    if config.skip and config.skip < config.layers:
+        rows[f"layer_{config.skip}"] = slice(config.width + 3, config.width + 3 + bands)
+    return rows
 
 
 def _draw(key, inputs: int, outputs: int, gain: float):
