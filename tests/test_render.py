@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from jaxpose import se3
+from jaxpose import render, se3
 from jaxpose.render import (
     Ray,
     composite,
@@ -207,3 +207,33 @@ def test_depth_of_a_wall_moves_with_the_camera_as_geometry_says(dtype):
     translation = -normal / (normal @ direction)
     rotation = -depth * np.cross(direction, normal) / (normal @ direction)
     assert_allclose(jacobian, np.concatenate([translation, rotation]), rtol=5e-3, atol=5e-3)
+
+
+@pytest.mark.parametrize("spacing", ["depth", "disparity"])
+def test_depths_are_one_in_each_part(spacing):
+    def parts(depth):
+        depth = np.asarray(depth, np.float64)
+        return (depth - 2) / 6 if spacing == "depth" else (1 / 2 - 1 / depth) / (1 / 2 - 1 / 8)
+
+    middles = render.sample_depths(None, 2.0, 8.0, 16, spacing=spacing)
+    assert_allclose(parts(middles), (np.arange(16) + 0.5) / 16, atol=1e-6)
+    keys = jax.random.split(jax.random.key(0), 200)
+    drawn = parts(jax.vmap(lambda key: render.sample_depths(key, 2.0, 8.0, 16, spacing=spacing))(keys))
+    within = drawn * 16 - np.arange(16)
+    assert within.min() > -1e-4 and within.max() < 1 + 1e-4
+    assert_allclose(within.mean(), 0.5, atol=0.02)
+    assert_allclose(within.std(), np.sqrt(1 / 12), atol=0.01)
+
+
+def test_depths_may_run_to_infinity():
+    depth = np.asarray(render.sample_depths(None, 1.0, jnp.inf, 64, spacing="disparity"))
+    assert_allclose(depth, 1 / (1 - (np.arange(64) + 0.5) / 64), rtol=1e-5)
+
+
+def test_weights_along_a_slanted_ray_are_those_of_its_true_lengths():
+    density, depth = jnp.asarray([0.2, 1.0, 0.5, 2.0]), jnp.asarray([1.0, 1.5, 2.5, 3.0])
+    slanted = render.density_weights(density, depth, length=1.3)
+    assert_allclose(slanted, render.density_weights(density, 1.3 * depth), rtol=1e-6)
+    assert_allclose(
+        render.density_weights(density, depth, length=1.0), render.density_weights(density, depth)
+    )
