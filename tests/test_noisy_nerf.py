@@ -187,6 +187,13 @@ def test_what_a_run_leaves(tmp_path):
     assert results["lpips"] is None and "n/a" in report(*outcome), (
         "images of 24 pixels are too small for LPIPS"
     )
+    loaded = noisy_nerf.load_run(outcome.folder)
+    poses = noisy_nerf.pose_reader(loaded.setup)(loaded.state.pose)
+    assert metrics.pose_errors(poses, reference.T).rotation_deg == pytest.approx(
+        errors.rotation_deg, rel=1e-4
+    )
+    density, _ = loaded.setup.scene.query(loaded.state.scene, jnp.zeros(3), jnp.ones(3))
+    assert np.isfinite(density) and float(loaded.state.scene["progress"]) == 1
     assert results["settled"]["psnr"] > 0 and results["wall_s"] > 0 and results["versions"]["jax"]
 
 

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import imageio.v3 as imageio
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -23,12 +24,21 @@ from jaxpose.data import blender
 from jaxpose.errors import DataError
 from jaxpose.experiments import command
 from jaxpose.experiments.noisy_nerf_measure import PROTOCOL, Measured, measure
-from jaxpose.experiments.noisy_nerf_options import CHUNK, ORBIT, Config, Problem, decisive, load
+from jaxpose.experiments.noisy_nerf_options import (
+    CHUNK,
+    ORBIT,
+    Config,
+    NetConfig,
+    Problem,
+    decisive,
+    load,
+)
 from jaxpose.experiments.noisy_nerf_report import Progress, progress_bar, report, table
 from jaxpose.experiments.noisy_nerf_setup import Setup, build, describe, splined
 from jaxpose.experiments.noisy_nerf_studies import STUDIES
+from jaxpose.fields import set_progress
 from jaxpose.io_transforms import write_transforms
-from jaxpose.nerf import State
+from jaxpose.nerf import State, Trainer
 from jaxpose.plots_nerf import History
 
 _SAVE_EVERY_S = 30.0
@@ -93,19 +103,8 @@ def train(
     label: str,
 ) -> Trained:
     """Train to the end, from the checkpoint if there is one, and keep one as it goes."""
-    trainer = nerf.trainer(
-        setup.scene,
-        setup.field,
-        problem.train.camera,
-        setup.depths,
-        setup.scene_rates,
-        setup.pose_rates,
-        setup.train,
-    )
+    trainer, trained = _fresh(config, problem, setup)
     steps = setup.train.steps
-    trained = Trained(
-        trainer.start(jax.random.key(config.seed)), np.full((steps // CHUNK, len(_COLUMNS)), np.nan)
-    )
     if checkpoint.exists():
         trained = io_checkpoint.load(checkpoint, trained)
     state, history = trained.state, trained.history.copy()
@@ -134,10 +133,52 @@ def train(
     return Trained(state, history)
 
 
+class Loaded(NamedTuple):
+    """A finished run: `setup.field.pose(state.pose, t)` is the camera's pose at any time [s], and
+    `setup.scene.query(state.scene, point, direction)` the density and colour of the scene."""
+
+    problem: Problem
+    setup: Setup
+    state: State
+
+
+def load_run(folder: Path | str) -> Loaded:
+    """The scene and the trajectory that a run has left in its folder; its data are read again.
+
+    DataError or OSError for a folder that holds no run.
+    """
+    settings = json.loads((Path(folder) / "settings.json").read_text())
+    net = settings.pop("net")
+    window = net.pop("window")
+    config = Config(
+        **settings | {"data": Path(settings["data"])}, net=NetConfig(**net, window=window and tuple(window))
+    )
+    problem = load(config)
+    setup = build(config, problem)
+    state = io_checkpoint.load(Path(folder) / "checkpoint.npz", _fresh(config, problem, setup)[1]).state
+    scene = set_progress(state.scene, jnp.ones(()))
+    return Loaded(problem, setup, state._replace(scene=scene))
+
+
 def pose_reader(setup: Setup) -> Callable[[Any], Float[np.ndarray, "n 4 4"]]:
     """Camera-to-world poses of the training images, from the parameters of the field."""
     compiled = jax.jit(lambda params: jax.vmap(setup.field.pose, (None, 0))(params, setup.views.t))
     return lambda params: np.asarray(compiled(params), np.float64)
+
+
+def _fresh(config: Config, problem: Problem, setup: Setup) -> tuple[Trainer, Trained]:
+    """The compiled training and where it starts."""
+    trainer = nerf.trainer(
+        setup.scene,
+        setup.field,
+        problem.train.camera,
+        setup.depths,
+        setup.scene_rates,
+        setup.pose_rates,
+        setup.train,
+    )
+    history = np.full((setup.train.steps // CHUNK, len(_COLUMNS)), np.nan)
+    return trainer, Trained(trainer.start(jax.random.key(config.seed)), history)
 
 
 def main(args: Sequence[str] | None = None) -> None:
