@@ -258,7 +258,7 @@ def _draw(folder: Path, config: Config, problem: Problem, measured: Measured, tr
         folder / "cameras.png", truth, measured.T_start, measured.T_estimate, f"{title}\n{found}"
     )
     psnr = f"{config.pose}, held-out PSNR {numbers['psnr']:.2f} dB"
-    plots_nerf.held_out(folder / "held_out.png", measured.views, f"{title}: {psnr}")
+    plots_nerf.held_out(folder / "held_out.png", measured.views, f"{title}\n{psnr}")
     plots_nerf.curves(folder / "curves.png", {config.pose: _history(trained.history)}, f"{title}\n{found}")
 
 
@@ -285,9 +285,8 @@ def _write_poses(folder: Path, config: Config, problem: Problem, measured: Measu
 
 def _title(problem: Problem) -> str:
     width, height = problem.about["size"]
-    return f"{problem.about['data']}, {problem.about['images']} views of {width}x{height}, noise " + str(
-        problem.about["noise"]
-    )
+    about = problem.about
+    return f"{about['data']}, {about['images']} views of {width}x{height}\nnoise {about['noise']}"
 
 
 def _history(rows: Float[np.ndarray, "c 6"]) -> History:

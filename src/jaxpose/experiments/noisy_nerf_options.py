@@ -119,7 +119,7 @@ def load(config: Config) -> Problem:
     extent = DIAMETER if config.data == ORBIT else float(pdist(train.T_world_cam[:, :3, 3]).max())
     T_start, words = _disturbed(config, train, extent)
     about = {
-        "data": train.name,
+        "data": "synthetic orbit" if config.data == ORBIT else train.name,
         "images": len(train.t),
         "held_out": len(held_out.t),
         "size": (train.camera.width, train.camera.height),
