@@ -136,6 +136,7 @@ def test_gradients_are_those_of_finite_differences():
     ("setting", "message"),
     [
         ({"layers": 0}, "sizes >= 1"),
+        ({"layers": 4, "skip": 3}, "skip: expected a layer from 1 to 2"),
         ({"octaves": -1}, "octaves >= 0"),
         ({"window": (0.5, 0.1)}, "start < end"),
     ],
@@ -143,3 +144,31 @@ def test_gradients_are_those_of_finite_differences():
 def test_settings_that_mean_nothing(setting, message):
     with pytest.raises(ValueError, match=message):
         NerfConfig(**setting)
+
+
+def test_the_window_shuts_bands_wherever_an_encoding_enters():
+    """Rows of every octave in both encodings: its weights get a gradient once it opens, and none before."""
+    params = random_params(SMALL, jnp.float32)
+    point, direction = jnp.asarray(POINTS[0], jnp.float32), jnp.asarray(DIRECTIONS[0], jnp.float32)
+    slope = jax.jit(jax.grad(lambda params: jnp.sum(nerf(SMALL).query(params, point, direction)[1])))
+    for progress, open_3, open_2 in ((0.05, 0, 0), (0.2, 1, 1), (0.28, 2, 1), (0.36, 2, 2), (0.5, 3, 2)):
+        gradient = slope(set_progress(params, jnp.asarray(progress, jnp.float32)))
+        for name, first, octaves, expected in (
+            ("layer_0", 0, 3, open_3),
+            ("layer_2", 12, 3, open_3),
+            ("colour_0", 12, 2, open_2),
+        ):
+            bands = np.abs(gradient[name]["kernel"])[first + 3 :].reshape(3, 2, octaves, -1).max((0, 1, 3))
+            assert_array_equal(bands > 0, np.arange(octaves) < expected, f"{name} at {progress}")
+
+
+def test_samples_of_many_rays_are_one_point_at_a_time():
+    params = set_progress(random_params(SMALL, jnp.float32), jnp.asarray(0.4, jnp.float32))
+    query = partial(nerf(SMALL).query, params)
+    points = jnp.asarray(np.random.default_rng(3).uniform(-2, 2, (3, 4, 3)), jnp.float32)
+    directions = jnp.asarray(DIRECTIONS[:3], jnp.float32)
+    density, rgb = jax.jit(jax.vmap(jax.vmap(query, (0, None))))(points, directions)
+    for ray, sample in np.ndindex(3, 4):
+        one = query(points[ray, sample], directions[ray])
+        assert_allclose(density[ray, sample], one[0], rtol=1e-5)
+        assert_allclose(rgb[ray, sample], one[1], atol=1e-6)

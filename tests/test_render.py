@@ -223,11 +223,12 @@ def test_depths_are_one_in_each_part(spacing):
     assert within.min() > -1e-4 and within.max() < 1 + 1e-4
     assert_allclose(within.mean(), 0.5, atol=0.02)
     assert_allclose(within.std(), np.sqrt(1 / 12), atol=0.01)
+    assert_allclose(np.corrcoef(within, rowvar=False), np.eye(16), atol=0.4)  # each part has its own draw
 
 
 def test_depths_may_run_to_infinity():
-    depth = np.asarray(render.sample_depths(None, 1.0, jnp.inf, 64, spacing="disparity"))
-    assert_allclose(depth, 1 / (1 - (np.arange(64) + 0.5) / 64), rtol=1e-5)
+    depth = np.asarray(render.sample_depths(None, 1.0, jnp.inf, 4096, spacing="disparity"))
+    assert_allclose(depth, 1 / (1 - (np.arange(4096) + 0.5) / 4096), rtol=1e-5)
 
 
 def test_weights_along_a_slanted_ray_are_those_of_its_true_lengths():
@@ -237,3 +238,24 @@ def test_weights_along_a_slanted_ray_are_those_of_its_true_lengths():
     assert_allclose(
         render.density_weights(density, depth, length=1.0), render.density_weights(density, depth)
     )
+
+
+@pytest.mark.parametrize(("far", "spacing"), [(8.0, "depth"), (8.0, "disparity"), (1e8, "disparity")])
+def test_depths_increase_and_are_the_keys_own(far, spacing):
+    keys = jax.random.split(jax.random.key(1), 50)
+    drawn = np.asarray(jax.vmap(lambda key: render.sample_depths(key, 2.0, far, 128, spacing=spacing))(keys))
+    assert np.isfinite(drawn).all() and (np.diff(drawn, axis=1) > 0).all()
+    assert (drawn >= 2).all() and (drawn <= far).all()
+    assert len(np.unique(drawn, axis=0)) == 50
+
+
+def test_a_ray_of_any_length_sees_the_same_fog(dtype):
+    """The direction twice as long and depths half as large: the same points, the same colours."""
+    origin, direction = jnp.asarray([0.1, -0.2, 0], dtype), jnp.asarray([0.6, 0, 0.8], dtype)
+    depths = jnp.linspace(0.5, 3, 40, dtype=dtype)
+    fog = lambda point, direction: (0.3 + jnp.sum(point**2), 0.5 + 0.1 * point)
+    short = render_ray(fog, Ray(origin, direction), depths, weights=density_weights)
+    weights = partial(density_weights, length=jnp.asarray(2, dtype))
+    long = render_ray(fog, Ray(origin, 2 * direction), depths / 2, weights=weights)
+    halved = short._replace(depth=short.depth / 2, variance=short.variance / 4)
+    chex.assert_trees_all_close(long, halved, rtol=RTOL[dtype])

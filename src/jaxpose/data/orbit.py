@@ -14,11 +14,11 @@ from jaxtyping import Array, Float, UInt8
 from jaxpose.camera import Camera, pixel_direction
 from jaxpose.recording import Photographs
 
-DIAMETER = 8.0  # of the circle [scene units]; the object fits into a ball of radius 1.35 at its centre
+DIAMETER = 8.0  # of the circle [scene units]; the object lies within 1.7 of its centre
 FIELD_OF_VIEW_DEG = 40.0
 SECONDS = 10.0  # one turn
 NEAR, FAR = 2.0, 6.5  # z-depths between which the object lies from every pose
-_SIZE = 1.1
+_SIZE, _RADIUS = 1.1, 1.7
 _HELD_OUT = 10  # views
 _SAMPLES = 2  # per pixel and axis
 _STEPS = 30  # of sphere tracing
@@ -92,7 +92,7 @@ def _trace(
     paint: Float[Array, "6"], origin: Float[Array, "3"], direction: Float[Array, "3"]
 ) -> Float[Array, "3"]:
     """Colour of what a ray of unit length meets."""
-    start = -jnp.vdot(origin, direction) - 1.5  # enters the ball around the object
+    start = -jnp.vdot(origin, direction) - _RADIUS  # enters the ball around the object
 
     def march(_, depth):
         return depth + distance(origin + depth * direction)
@@ -102,7 +102,7 @@ def _trace(
     normal = jax.grad(distance)(point)
     light = jnp.asarray([0.4, -0.5, 0.77])
     shade = 0.45 + 0.55 * jnp.maximum(jnp.vdot(normal, light) / (jnp.linalg.norm(normal) + 1e-6), 0)
-    hit = (distance(point) < 0.02) & (depth < start + 3.0)
+    hit = (distance(point) < 0.02) & (depth < start + 2 * _RADIUS)
     return jnp.where(hit, shade * _albedo(paint, point), 1.0)
 
 

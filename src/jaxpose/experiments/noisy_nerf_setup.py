@@ -19,7 +19,7 @@ from jaxpose.scenes import NerfConfig, SceneField, nerf
 _FAST_SCENE = NerfConfig(
     layers=4, width=96, skip=2, colour_width=48, octaves=7, window=(0.15, 0.5), quiet=True
 )
-_SMOKE_SCENE = NerfConfig(layers=2, width=16, skip=1, colour_width=8, octaves=4, window=(0.1, 0.5))
+_SMOKE_SCENE = NerfConfig(layers=2, width=16, skip=None, colour_width=8, octaves=4, window=(0.1, 0.5))
 _FAST = TrainConfig(steps=5000, rays=1024, samples=32, chunk=64)
 _PAPER = TrainConfig(steps=200_000, rays=4096, samples=128, chunk=32)
 _SMOKE = TrainConfig(steps=CHUNK, rays=64, samples=8, chunk=32)

@@ -35,6 +35,9 @@ class NerfConfig:
             or min(self.octaves, self.direction_octaves) < 0
         ):
             raise ValueError(f"NerfConfig: expected sizes >= 1 and octaves >= 0, got {self}")
+        if self.skip is not None and not 0 < self.skip < self.layers - 1:
+            # The last layer's inputs are also the density's, which BARF's skip does not reach.
+            raise ValueError(f"skip: expected a layer from 1 to {self.layers - 2} or None, got {self.skip}")
         if self.window is not None and self.window[0] >= self.window[1]:
             raise ValueError(f"window: expected (start, end) with start < end, got {self.window}")
 
@@ -85,7 +88,7 @@ def _encode(config, params, x, octaves):
 
 def _layer(config, params, number, hidden, encoded):
     layer = params[f"layer_{number}"]
-    if number == 0 or number != config.skip:
+    if number != config.skip:
         return jax.nn.relu(dense(layer, hidden))
     # Two products in place of one of both inputs joined, which would first have to be copied together.
     kernel = layer["kernel"]
@@ -111,7 +114,7 @@ def _bands(config: NerfConfig) -> dict[str, slice]:
     """Rows of kernels that see bands of an encoding, by layer."""
     bands, along = 6 * config.octaves, 6 * config.direction_octaves
     rows = {"layer_0": slice(3, 3 + bands), "colour_0": slice(config.width + 3, config.width + 3 + along)}
-    if config.skip and config.skip < config.layers:
+    if config.skip is not None:
         rows[f"layer_{config.skip}"] = slice(config.width + 3, config.width + 3 + bands)
     return rows
 
