@@ -1,4 +1,4 @@
-"""What every experiment's command does: options to a config, known errors to one line, the report."""
+"""What every experiment's command does: options to a config, known errors to one line, reports, tables."""
 
 import io
 import re
@@ -43,6 +43,17 @@ def guarded(name: str, action: Callable[[], str]) -> None:
         sys.exit(f"{name}: {' '.join(str(error).split())}")
     except KeyboardInterrupt:
         sys.exit(f"{name}: interrupted, nothing written")
+
+
+def markdown_table(rows: Sequence[Sequence[str]]) -> str:
+    """Rows of cells as a table in Markdown, the first its head, columns as wide as they need to be."""
+    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
+    lines = [
+        "| " + " | ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) + " |"
+        for row in rows
+    ]
+    lines.insert(1, "|" + "|".join("-" * (width + 2) for width in widths) + "|")
+    return "\n".join(lines)
 
 
 def _one_line(boxed: str) -> str:

@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 
 from tqdm import tqdm
 
+from jaxpose.experiments.command import markdown_table
+
 _COLUMNS: tuple[str, ...] = (
     "run", "RE [deg]", "TE [units]", "TE [%]", "centres [%]", "PSNR [dB]", "SSIM", "LPIPS", "train [s]",
 )  # fmt: skip
@@ -68,13 +70,7 @@ def table(runs: dict[str, dict[str, Any]]) -> str:
         )
         for label, run in runs.items()
     ]
-    widths = [max(len(row[k]) for row in rows) for k in range(len(_COLUMNS))]
-    lines = [
-        "| " + " | ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) + " |"
-        for row in rows
-    ]
-    lines.insert(1, "|" + "|".join("-" * (width + 2) for width in widths) + "|")
-    return "\n".join(lines)
+    return markdown_table(rows)
 
 
 def report(folder: Path, results: dict[str, Any]) -> str:

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from tqdm import tqdm
 
+from jaxpose.experiments.command import markdown_table
 from jaxpose.experiments.planar_task import PATCHES, PROTOCOL, Photo
 from jaxpose.experiments.planar_warps import RESET_EVERY, SPLINE_KNOTS, Warps
 
@@ -110,13 +111,7 @@ def table(by_field: dict[str, dict[str, Any]]) -> str:
             _number(results["psnr"]["mean"], 2),
             _number(results["seconds_per_motion"]["median"], 1),
         ))  # fmt: skip
-    widths = [max(len(row[k]) for row in rows) for k in range(len(_COLUMNS))]
-    lines = [
-        "| " + " | ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) + " |"
-        for row in rows
-    ]
-    lines.insert(1, "|" + "|".join("-" * (width + 2) for width in widths) + "|")
-    return "\n".join(lines)
+    return markdown_table(rows)
 
 
 def report(folder: Path, results: dict[str, Any]) -> str:

@@ -8,6 +8,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+from jaxpose.experiments.command import markdown_table
 from jaxpose.slam.run import ImuMode, Progress
 
 _COLUMNS: tuple[str, ...] = ("IMU", "ATE [cm]", "RPE [cm]", "RPE [deg]", "frames lost", "s / frame")
@@ -49,13 +50,7 @@ def table(by_mode: dict[str, dict[str, Any]]) -> str:
             f"{results['frames_lost']} of {results['frames']}",
             f"{results['seconds_per_frame']:.2f}",
         ))  # fmt: skip
-    widths = [max(len(row[k]) for row in rows) for k in range(len(_COLUMNS))]
-    lines = [
-        "| " + " | ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) + " |"
-        for row in rows
-    ]
-    lines.insert(1, "|" + "|".join("-" * (width + 2) for width in widths) + "|")
-    return "\n".join(lines)
+    return markdown_table(rows)
 
 
 def report(folder: Path, results: dict[str, Any]) -> str:
