@@ -2,6 +2,11 @@
 
 import json
 import re
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +20,7 @@ from jaxpose.data import blender
 from jaxpose.experiments import noisy_nerf
 from jaxpose.experiments.noisy_nerf_options import Config, NetConfig, load
 from jaxpose.experiments.noisy_nerf_report import report, table
-from jaxpose.experiments.noisy_nerf_setup import build, splined
+from jaxpose.experiments.noisy_nerf_setup import _SMOKE, build, splined
 from jaxpose.experiments.noisy_nerf_studies import STUDIES
 
 FILES = {
@@ -159,11 +164,26 @@ def test_a_killed_run_resumed_has_the_numbers_of_a_whole_one(tmp_path, monkeypat
 
 
 def build_three_chunks():
-    from dataclasses import replace
-
-    from jaxpose.experiments.noisy_nerf_setup import _SMOKE
-
     return replace(_SMOKE, steps=300, rays=16)
+
+
+@pytest.mark.slow
+def test_sigkill_in_the_middle_changes_no_number(tmp_path):
+    """The real signal, to a process in the middle of its steps."""
+    args = "--orbit-views 10 --image-width 24 --rays 256 --steps 1500 --settle-steps 2".split()
+    code = "from jaxpose.experiments import noisy_nerf as n; n._SAVE_EVERY_S = 0; n.main()"
+    start = lambda out: subprocess.Popen([sys.executable, "-c", code, *args, "--out", out, "--resume"])
+    assert start(tmp_path / "whole").wait() == 0
+    process, checkpoint = start(tmp_path / "cut"), tmp_path / "cut" / "checkpoint.npz"
+    while not checkpoint.exists():
+        time.sleep(0.02)
+    process.kill()
+    assert process.wait() == -signal.SIGKILL
+    with np.load(checkpoint) as file:
+        assert file[".state.step"] < 1500
+    assert start(tmp_path / "cut").wait() == 0
+    whole, cut = (json.loads((tmp_path / n / "results.json").read_text()) for n in ("whole", "cut"))
+    assert numbers(cut) == numbers(whole)
 
 
 def test_what_a_run_leaves(tmp_path):
