@@ -42,7 +42,7 @@ def guarded(name: str, action: Callable[[], str]) -> None:
     except (DataError, OSError) as error:
         sys.exit(f"{name}: {' '.join(str(error).split())}")
     except KeyboardInterrupt:
-        sys.exit(f"{name}: interrupted, nothing written")
+        sys.exit(f"{name}: interrupted")
 
 
 def markdown_table(rows: Sequence[Sequence[str]]) -> str:
