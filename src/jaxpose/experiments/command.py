@@ -1,13 +1,16 @@
-"""What every experiment's command does: options to a config, known errors to one line, reports, tables."""
+"""What every experiment's command does: options to a config, known errors to one line, bars, tables."""
 
 import io
+import json
 import re
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stderr
-from typing import TypeVar
+from pathlib import Path
+from typing import Any, TypeVar
 
 import tyro
+from tqdm import tqdm
 
 from jaxpose.errors import DataError
 
@@ -43,6 +46,40 @@ def guarded(name: str, action: Callable[[], str]) -> None:
         sys.exit(f"{name}: {' '.join(str(error).split())}")
     except KeyboardInterrupt:
         sys.exit(f"{name}: interrupted")
+
+
+def step_bar() -> Callable[[str, int, int, dict[str, str]], None]:
+    """Draws a bar on stderr for each optimisation: call it with name, steps done, steps in all, and state."""
+    bar: tqdm | None = None
+    done = 0
+
+    def on_step(name: str, step: int, steps: int, state: dict[str, str]) -> None:
+        nonlocal bar, done
+        if bar is None:
+            bar, done = tqdm(total=steps, desc=name, unit="step", file=sys.stderr), 0
+        bar.set_postfix(state, refresh=False)
+        bar.update(step - done)
+        done = step
+        if step == steps:
+            bar.close()
+            bar = None
+
+    return on_step
+
+
+def resumes(folder: Path, stored: Path, settings: dict[str, Any], resume: bool) -> bool:
+    """Whether what a run folder holds is to be kept: on `resume`, if `stored` says that it is a run's.
+
+    DataError where it is that of a run with other settings (in JSON's types).
+    """
+    if not (resume and stored.exists()):
+        return False
+    before = json.loads(stored.read_text())
+    for name, value in settings.items():
+        if before.get(name) != value:
+            option = name.replace("_", "-")
+            raise DataError(f"{folder}: expected --{option} {before.get(name)}, as it began, got {value}")
+    return True
 
 
 def markdown_table(rows: Sequence[Sequence[str]]) -> str:

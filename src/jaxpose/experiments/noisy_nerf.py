@@ -227,13 +227,7 @@ def _prepare(folder: Path, config: Config) -> None:
     """Leave in the folder the config, and earlier results only if they are this run's and to be kept."""
     stored = folder / "settings.json"
     settings = json.loads(json.dumps(decisive(config), default=_named))
-    if config.resume and stored.exists():
-        before = json.loads(stored.read_text())
-        for name, value in settings.items():
-            if before.get(name) != value:
-                option = name.replace("_", "-")
-                raise DataError(f"{folder}: expected --{option} {before.get(name)}, as it began, got {value}")
-    else:
+    if not command.resumes(folder, stored, settings, config.resume):
         for name in ("checkpoint.npz", "results.json"):
             (folder / name).unlink(missing_ok=True)
         io.write_json(stored, settings)

@@ -1,13 +1,10 @@
 """What the noisy-pose experiment says: a bar while it trains, then numbers with their protocol."""
 
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tqdm import tqdm
-
-from jaxpose.experiments.command import markdown_table
+from jaxpose.experiments.command import markdown_table, step_bar
 
 _COLUMNS: tuple[str, ...] = (
     "run", "RE [deg]", "TE [units]", "TE [%]", "centres [%]", "PSNR [dB]", "SSIM", "LPIPS", "train [s]",
@@ -29,27 +26,12 @@ class Progress(NamedTuple):
 
 def progress_bar() -> Callable[[Progress], None]:
     """A callback for `run` that draws a bar on stderr for each training."""
-    bar: tqdm | None = None
-    done = 0
+    bar = step_bar()
 
     def on_progress(progress: Progress) -> None:
-        nonlocal bar, done
-        if bar is None:
-            done = 0
-            bar = tqdm(total=progress.steps, desc=progress.label or "training", unit="step", file=sys.stderr)
-        bar.set_postfix(
-            {
-                "loss": f"{progress.loss:.5f}",
-                "PSNR": f"{progress.psnr:.2f} dB",
-                "off": f"{progress.rotation_deg:.2f} deg {100 * progress.translation / progress.extent:.2f}%",
-            },
-            refresh=False,
-        )
-        bar.update(progress.step - done)
-        done = progress.step
-        if progress.step == progress.steps:
-            bar.close()
-            bar = None
+        off = f"{progress.rotation_deg:.2f} deg {100 * progress.translation / progress.extent:.2f}%"
+        state = {"loss": f"{progress.loss:.5f}", "PSNR": f"{progress.psnr:.2f} dB", "off": off}
+        bar(progress.label or "training", progress.step, progress.steps, state)
 
     return on_progress
 

@@ -133,8 +133,3 @@ def _field(config: Config, problem: Problem) -> tuple[PoseField, Any]:
     else:
         field, columns = fields.table(photographs.t), (3, 3)
     return field, Rate(first, last, np.repeat(starts, columns)[None])
-
-
-def resets(config: Config) -> bool:
-    """Whether the table is reset to a spline between chunks of steps."""
-    return config.pose == "spline_reset"

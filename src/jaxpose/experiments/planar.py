@@ -18,7 +18,6 @@ from jaxtyping import Float
 from matplotlib import cbook
 
 from jaxpose import io, plots_planar
-from jaxpose.errors import DataError
 from jaxpose.experiments import command, planar_fit, planar_task
 from jaxpose.experiments.planar_fit import CHUNK, Aligned, Aligner
 from jaxpose.experiments.planar_report import (
@@ -206,12 +205,7 @@ def _prepare(folder: Path, config: Config) -> None:
     decisive = {name: value for name, value in asdict(config).items() if name in _DECISIVE}
     decisive["image"] = str(Path(decisive["image"]).resolve())
     stored = folder / "motions" / "settings.json"
-    if config.resume and stored.exists():
-        before = json.loads(stored.read_text())
-        for name, value in decisive.items():
-            if before.get(name) != value:
-                raise DataError(f"{folder}: expected --{name} {before.get(name)}, as it began, got {value}")
-    else:
+    if not command.resumes(folder, stored, decisive, config.resume):
         for file in (folder / "motions").glob("*.json"):
             file.unlink()
         io.write_json(stored, decisive)

@@ -1,14 +1,12 @@
 """What the planar experiment says: a bar while it runs, then numbers with their protocol."""
 
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from tqdm import tqdm
 
-from jaxpose.experiments.command import markdown_table
+from jaxpose.experiments.command import markdown_table, step_bar
 from jaxpose.experiments.planar_task import PATCHES, PROTOCOL, Photo
 from jaxpose.experiments.planar_warps import RESET_EVERY, SPLINE_KNOTS, Warps
 
@@ -38,21 +36,12 @@ class Progress(NamedTuple):
 
 def progress_bar() -> Callable[[Progress], None]:
     """A callback for `run` that draws a bar on stderr for each motion."""
-    bar: tqdm | None = None
-    done = 0
+    bar = step_bar()
 
     def on_progress(progress: Progress) -> None:
-        nonlocal bar, done
-        if bar is None:
-            name = f"{progress.pose} {progress.motion + 1}/{progress.motions}"
-            bar, done = tqdm(total=progress.steps, desc=name, unit="step", file=sys.stderr), 0
+        name = f"{progress.pose} {progress.motion + 1}/{progress.motions}"
         state = {"loss": f"{progress.loss:.5f}", "corners": f"{progress.corner_px:.2f} px"}
-        bar.set_postfix(state, refresh=False)
-        bar.update(progress.step - done)
-        done = progress.step
-        if progress.step == progress.steps:
-            bar.close()
-            bar = None
+        bar(name, progress.step, progress.steps, state)
 
     return on_progress
 
