@@ -80,7 +80,9 @@ def test_noise_is_on_the_side_and_as_large_as_stated(side):
 def test_other_starts():
     none, unknown = load(smoke(noise="none")), load(smoke(noise="unknown"))
     assert_array_equal(none.T_start, none.train.T_world_cam)
-    assert_array_equal(unknown.T_start, np.tile(np.eye(4), (8, 1, 1)))
+    at_rest = np.tile(np.eye(4), (8, 1, 1))
+    at_rest[:, 2, 3] = -(unknown.train.near + unknown.train.far) / 2  # the origin in the middle of the depths
+    assert_allclose(unknown.T_start, at_rest, rtol=1e-12)
     independent = load(smoke(noise="independent", noise_sigma=0.01))
     assert 0 < np.abs(independent.T_start - none.T_start).max() < 0.2
     assert len(load(smoke(every=2)).train.t) == 4
@@ -245,6 +247,21 @@ def test_real_photographs(data_dir, tmp_path, scene, noise, views):
     assert results["data"]["images"] == views and results["rotation_error_deg"] < 180
     poses = json.loads((tmp_path / "run" / "transforms.json").read_text())["frames"]
     assert len(poses) == views
+
+
+@pytest.mark.data
+def test_unknown_poses_start_before_the_middle_of_disparity(data_dir):
+    problem = load(smoke(data=data_dir / "llff_fern", noise="unknown"))
+    assert_allclose(problem.T_start[:, :3, 3], [[0, 0, -2]] * 8, rtol=1e-6)  # of disparities 1 to 0
+
+
+@pytest.mark.data
+@pytest.mark.slow
+def test_unknown_poses_of_a_forward_facing_scene_are_found(data_dir, tmp_path):
+    config = Config(data=data_dir / "llff_fern", noise="unknown", steps=1000, settle_steps=0, out=tmp_path)
+    results = noisy_nerf.run(config).results
+    assert results["start"]["translation_error_percent"] > 25
+    assert results["translation_error_percent"] < 8 and results["rotation_error_deg"] < 20
 
 
 # --- what is not possible --------------------------------------------------------------------------------

@@ -45,7 +45,7 @@ class Config:
         "posenet"  # the pose field; spline_reset: a table, reset to a smoothing spline every 100 steps
     )
     preset: Literal["fast", "paper"] = "fast"  # a small network for CPUs, or BARF's with the paper's schedule
-    # Of the poses that the run starts from. "none": as the data has them; "unknown": all at the identity.
+    # Of the poses that the run starts from. "none": as the data has them; "unknown": all in one place.
     noise: Literal["correlated", "independent", "none", "unknown"] = "correlated"
     noise_translation: float = 0.2  # largest deviation, as a share of the largest distance between cameras
     noise_rotation_deg: float = 0.0  # largest deviation
@@ -153,13 +153,25 @@ def _photographs(config: Config) -> tuple[Photographs, Photographs]:
     return train, held_out
 
 
+def _middle(photographs: Photographs) -> float:
+    """Depth of the middle of the scene, where a world that is not known yet has its origin.
+
+    Turns on the world's side then go about what the cameras look at. About the cameras themselves, turning
+    and moving shift an image alike, the scene explains away what differs, and the poses do not come apart.
+    """
+    near, far = photographs.near, photographs.far
+    return 2 / (1 / near + 1 / far) if photographs.spacing == "disparity" else (near + far) / 2
+
+
 def _disturbed(config: Config, train: Photographs, extent: float) -> tuple[Float[np.ndarray, "n 4 4"], str]:
     """The poses to start from, and what was done to them."""
     truth = train.T_world_cam
     if config.noise == "none":
         return truth, "none: the poses of the data"
     if config.noise == "unknown":
-        return np.tile(np.eye(4), (len(truth), 1, 1)), "poses unknown: all start at the identity"
+        T_same = np.tile(np.eye(4), (len(truth), 1, 1))
+        T_same[:, 2, 3] = -_middle(train)
+        return T_same, "poses unknown: all start in one place"
     if config.noise == "independent":
         T_noise = noise.independent(len(truth), config.noise_sigma, config.seed)
         words = f"independent, twists of N(0, {config.noise_sigma:g}^2) [scene units and rad]"

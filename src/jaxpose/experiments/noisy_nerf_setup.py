@@ -26,6 +26,18 @@ _SMOKE = TrainConfig(steps=CHUNK, rays=64, samples=8, chunk=32)
 # In short trainings on poses far off: first a blurred scene forms, then the cameras move to where it is seen,
 # then they turn. Free at once, they run after a scene that does not exist yet, and do not come back.
 _SHIFT_FROM, _TURN_FROM = 0.03, 0.06  # shares of the training
+# Parallax alone tells how cameras in one place have turned, and a blurred scene does not show it.
+_UNKNOWN_WINDOW = (0.0, 0.05)
+# Adam's first and last rate for translation and rotation, by how the training goes.
+_NET_RATES = {
+    "paper": ((1e-3, 1e-5), (2e-4, 1e-6)),
+    "noisy": ((3e-4, 2e-5), (3e-4, 2e-5)),
+    "unknown": ((6e-4, 4e-5), (2e-3, 1e-4)),
+}
+_TABLE_RATES = {  # also of splines; with preset paper BARF's
+    "noisy": ((3e-3, 1e-4), (3e-3, 1e-4)),
+    "unknown": ((2e-3, 1e-4), (6e-3, 3e-4)),
+}
 _BARF_SETTLE = {"depth": 1e-3, "disparity": 3e-3}  # BARF's rate of test-time poses, Blender and LLFF
 
 
@@ -49,7 +61,7 @@ def build(config: Config, problem: Problem) -> Setup:
     if config.smoke:
         scene, train = nerf(_SMOKE_SCENE), _SMOKE
     else:
-        scene, train = (nerf(), _PAPER) if paper else (nerf(_FAST_SCENE), _FAST)
+        scene, train = (nerf(), _PAPER) if paper else (nerf(_fast_scene(config)), _FAST)
         train = replace(train, steps=config.steps or train.steps, rays=config.rays or train.rays)
     if not paper:
         scene_rates = Rate(1e-3, 1e-4)
@@ -115,21 +127,30 @@ def _field(config: Config, problem: Problem) -> tuple[PoseField, Any]:
     """The correction of the poses by itself, and its rates."""
     photographs, paper = problem.train, config.preset == "paper"
     span = (float(photographs.t[0]), float(photographs.t[-1]))
-    starts = (0.0, 0.0) if paper else (_SHIFT_FROM, _TURN_FROM)
+    shift_from, turn_from = (0.0, 0.0) if paper else (_SHIFT_FROM, _TURN_FROM)
+    start = "unknown" if config.noise == "unknown" else "noisy"
     if config.pose == "posenet":
         # tanh bounds the translation: half the cameras' extent, or, where nothing is known of them, the
         # nearest depth, which is the unit of LLFF's scenes.
         scale = photographs.near if config.noise == "unknown" else problem.extent / 2
         net = replace(config.net, layers=2, width=32) if config.smoke else config.net
         field = fields.posenet(PoseNetConfig(span=span, translation_scale=scale, **asdict(net)))
-        shift, turn = ((1e-3, 1e-5), (2e-4, 1e-6)) if paper else ((3e-4, 2e-5), (3e-4, 2e-5))
-        rates = {"translation": Rate(*shift, starts[0]), "rotation": Rate(*turn, starts[1])}
+        shift, turn = _NET_RATES["paper" if paper else start]
+        rates = {"translation": Rate(*shift, shift_from), "rotation": Rate(*turn, turn_from)}
         if config.net.coupled:
             rates = {"coupled": rates["rotation"]}
         return field, rates if config.net.window is None else rates | {"progress": Rate(1.0, 1.0)}
-    first, last = (3e-3 if photographs.spacing == "disparity" else 1e-3, 1e-5) if paper else (3e-3, 1e-4)
+    if paper:
+        shift = turn = (3e-3 if photographs.spacing == "disparity" else 1e-3, 1e-5)
+    else:
+        shift, turn = _TABLE_RATES[start]
     if config.pose == "bspline":
         field, columns = fields.bspline(span, config.spline_knots), (3, 4)
     else:
         field, columns = fields.table(photographs.t), (3, 3)
-    return field, Rate(first, last, np.repeat(starts, columns)[None])
+    pairs = zip((*shift, shift_from), (*turn, turn_from), strict=True)
+    return field, Rate(*(np.repeat(pair, columns)[None] for pair in pairs))
+
+
+def _fast_scene(config: Config) -> NerfConfig:
+    return replace(_FAST_SCENE, window=_UNKNOWN_WINDOW) if config.noise == "unknown" else _FAST_SCENE
