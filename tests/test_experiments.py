@@ -23,7 +23,9 @@ from jaxpose.recording import Recording
 README = Path(__file__).parents[1] / "README.md"
 FRAMES = 8
 PICTURES = {"trajectory.png", "errors.png", "renders.png"}
-FILES = {"config.json", "results.json", "trajectory.txt", "reference.txt", "field.npz"} | PICTURES
+FILES = PICTURES | {
+    "config.json", "results.json", "trajectory.txt", "reference.txt", "field.npz", "camera.json",
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module", autouse=True)

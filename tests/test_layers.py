@@ -8,8 +8,8 @@ import pytest
 import jaxpose
 
 LAYERS = (
-    "errors se3 camera nn fields motion scenes render imu events losses metrics train recording nerf slam"
-    " data io plots experiments cli"
+    "errors numpy_field se3 camera nn fields motion scenes render imu events losses metrics train recording"
+    " nerf slam data io plots command experiments commands cli"
 ).split()
 BESIDE = {
     "ekf": "imu",

@@ -101,6 +101,36 @@ def test_rpe_agrees_with_evo(real, delta, alignment):
         assert ours.pairs == len(theirs.error)
 
 
+@pytest.mark.data
+@pytest.mark.parametrize("delta", [0.05, 0.5, 2.0])
+@pytest.mark.parametrize("alignment", ["none", "sim3"])
+def test_rpe_over_metres_agrees_with_evo(real, delta, alignment):
+    import copy
+
+    from evo.core.metrics import RPE, PoseRelation, Unit
+
+    truth, estimate, T_truth, T_estimate = real
+    estimate = copy.deepcopy(estimate)
+    if alignment != "none":
+        estimate.align(truth, correct_scale=True)
+    ours = metrics.rpe(T_estimate, T_truth, delta, alignment, along=metrics.path_length(T_truth))
+    for relation, statistics in (
+        (PoseRelation.translation_part, ours.translation_m),
+        (PoseRelation.rotation_angle_deg, ours.rotation_deg),
+    ):
+        theirs = RPE(
+            relation,
+            delta=delta,
+            delta_unit=Unit.meters,
+            rel_delta_tol=0.1,
+            all_pairs=True,
+            pairs_from_reference=True,
+        )
+        theirs.process_data((truth, estimate))
+        assert_same_statistics(statistics, theirs)
+        assert ours.pairs == len(theirs.error) > 100
+
+
 # --- closed forms -------------------------------------------------------------------------------------------
 
 
@@ -279,3 +309,36 @@ def test_a_delta_of_nothing_is_refused():
     T = random_poses(np.random.default_rng(11), 4)
     with pytest.raises(ValueError, match="delta of at least 1"):
         metrics.rpe(T, T, delta=0)
+
+
+@settings(deadline=None)
+@given(SEEDS, st.sampled_from([0.5, 1.0, 3.0]))
+def test_pairs_are_the_nearest_within_a_tenth(seed, delta):
+    """Against trying every pair; steps on a grid, so that stretches at rest and equal distances happen."""
+    rng = np.random.default_rng(seed)
+    steps = rng.choice([0.0, 0.25, 0.26, 1.0], size=29)
+    truth = np.tile(np.eye(4), (30, 1, 1))
+    truth[1:, 0, 3] = np.cumsum(steps)
+    along = metrics.path_length(truth)
+    np.testing.assert_allclose(along, truth[:, 0, 3], atol=1e-12)
+    expected = []
+    for i in range(30):
+        off = np.abs(along[i + 1 :] - along[i] - delta)
+        if len(off) and off.min() <= 0.1 * delta:
+            expected.append((i, i + 1 + int(off.argmin())))
+    estimate = truth.copy()
+    estimate[:, 0, 3] *= 1.1
+    if expected:
+        found = metrics.rpe(estimate, truth, delta, along=along)
+        lengths = [0.1 * (truth[j, 0, 3] - truth[i, 0, 3]) for i, j in expected]
+        np.testing.assert_allclose(found.translation_errors_m, lengths, atol=1e-12)
+    else:
+        with pytest.raises(DataError, match="apart"):
+            metrics.rpe(estimate, truth, delta, along=along)
+
+
+def test_a_path_is_not_cut_by_poses_that_are_missing():
+    truth = np.tile(np.eye(4), (5, 1, 1))
+    truth[:, 1, 3] = [0, 1, 3, 2, 4]
+    truth[[0, 2]] = np.nan
+    np.testing.assert_array_equal(metrics.path_length(truth), [0, 0, 0, 1, 3])

@@ -26,7 +26,7 @@ from jaxpose.experiments.noisy_nerf_studies import STUDIES
 FILES = {
     "config.json", "settings.json", "results.json", "checkpoint.npz", "start.npz", "trajectory.txt",
     "reference.txt", "cameras.png", "held_out.png", "curves.png", "transforms_train.json",
-    "transforms_test.json", "train", "held_out",
+    "transforms_test.json", "train", "held_out", "field.npz", "camera.json",
 }  # fmt: skip
 
 

@@ -11,7 +11,6 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
@@ -23,6 +22,7 @@ from jaxpose.metrics import nearest_rotation
 _TUM_COLUMNS = "8 numbers (t tx ty tz qx qy qz qw)"
 _KITTI_COLUMNS = "12 numbers (the rows of a 3x4 pose)"
 _EUROC_COLUMNS = "17 numbers (stamp, position, quaternion wxyz, velocity, biases) or the first 8 of them"
+_EUROC_NAMES = [f"p_RS_R_{axis} [m]" for axis in "xyz"] + [f"q_RS_{axis} []" for axis in "wxyz"]
 _MOST_OFF_ROTATION = 1e-2  # entries of a rotation matrix; more is not rounding
 
 
@@ -42,7 +42,7 @@ def read_tum(path: Path | str) -> Trajectory:
     DataError naming file and line for a wrong number of columns, text or NaN where a number belongs, a zero
     quaternion, or stamps that repeat or go backwards; FileNotFoundError as usual.
     """
-    lines, values = _read_numbers(Path(path), _TUM_COLUMNS, counts=(8,))
+    lines, values = read_numbers(Path(path), _TUM_COLUMNS, counts=(8,))
     return _stamped(Path(path), lines, values[:, 0], values[:, 1:4], values[:, 4:])
 
 
@@ -65,17 +65,10 @@ def read_kitti(path: Path | str, *, rate_hz: float = 10.0) -> Trajectory:
     `read_tum`, and for a matrix that is more than rounding off a rotation.
     """
     path = Path(path)
-    lines, values = _read_numbers(path, _KITTI_COLUMNS, counts=(12,))
+    lines, values = read_numbers(path, _KITTI_COLUMNS, counts=(12,))
     T = np.tile(np.eye(4), (len(values), 1, 1))
     T[:, :3] = values.reshape(-1, 3, 4)
-    rotation = nearest_rotation(T[:, :3, :3])
-    off = np.abs(T[:, :3, :3] - rotation).max(axis=(1, 2))
-    if off.max() > _MOST_OFF_ROTATION:
-        raise DataError(
-            f"{path}:{lines[off.argmax()]}: expected a rotation, got a matrix {off.max():.2g} off one"
-        )
-    T[:, :3, :3] = rotation
-    return Trajectory(np.arange(len(T)) / rate_hz, T)
+    return Trajectory(np.arange(len(T)) / rate_hz, orthonormal(path, lines, T))
 
 
 def write_kitti(path: Path | str, T_world_cam: Float[np.ndarray, "n 4 4"]) -> None:
@@ -91,8 +84,41 @@ def read_euroc(path: Path | str) -> Trajectory:
 
     Stamps become float64 seconds since 1970, which resolves 0.24 microseconds. DataError as `read_tum`.
     """
-    lines, values = _read_numbers(Path(path), _EUROC_COLUMNS, counts=(17, 8), separator=",")
+    lines, values = read_numbers(Path(path), _EUROC_COLUMNS, counts=(17, 8), separator=",")
     return _stamped(Path(path), lines, values[:, 0] / 1e9, values[:, 1:4], values[:, [5, 6, 7, 4]])
+
+
+def write_euroc(path: Path | str, trajectory: Trajectory) -> None:
+    """Write the first 8 columns of EuRoC's truth, which are all that TUM-VI's has; stamps in whole ns.
+
+    DataError for poses with NaN, and for stamps less than a nanosecond apart.
+    """
+    finite = np.isfinite(trajectory.T).all((1, 2))
+    if not finite.all():
+        raise DataError(f"{path}: expected finite poses, got NaN or infinity in row {finite.argmin()}")
+    ns = [round(t * 1e9) for t in trajectory.t.tolist()]
+    if (np.diff(ns) <= 0).any():
+        raise DataError(f"{path}: expected stamps at least 1 ns apart, got closer ones")
+    quaternion_wxyz = Rotation.from_matrix(trajectory.T[:, :3, :3]).as_quat(canonical=True, scalar_first=True)
+    rows = np.column_stack([trajectory.T[:, :3, 3], quaternion_wxyz]).tolist()
+    lines = [",".join(map(repr, [stamp, *row])) + "\n" for stamp, row in zip(ns, rows, strict=True)]
+    write_text(path, f"#timestamp [ns],{','.join(_EUROC_NAMES)}\n" + "".join(lines))
+
+
+def orthonormal(path: Path, lines: list[int], T: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 4 4"]:
+    """The poses with rotations orthonormal to the last digit.
+
+    DataError naming the line of the worst if it is more than rounding off a rotation.
+    """
+    rotation = nearest_rotation(T[:, :3, :3])
+    off = np.abs(T[:, :3, :3] - rotation).max(axis=(1, 2))
+    if off.max() > _MOST_OFF_ROTATION:
+        raise DataError(
+            f"{path}:{lines[off.argmax()]}: expected a rotation, got a matrix {off.max():.2g} off one"
+        )
+    T = T.copy()
+    T[:, :3, :3] = rotation
+    return T
 
 
 def associate(
@@ -104,9 +130,9 @@ def associate(
     two equally near; one stamp of the longer may serve two. DataError if none matches.
     """
     if len(t_b) <= len(t_a):
-        near_a, near_b = _nearest(t_b, t_a), np.arange(len(t_b))
+        near_a, near_b = nearest(t_b, t_a), np.arange(len(t_b))
     else:
-        near_a, near_b = np.arange(len(t_a)), _nearest(t_a, t_b)
+        near_a, near_b = np.arange(len(t_a)), nearest(t_a, t_b)
     close = np.abs(t_a[near_a] - t_b[near_b]) <= max_difference
     if not close.any():
         spans = [f"{t[0]:.3f} to {t[-1]:.3f} s" if len(t) else "no stamps" for t in (t_a, t_b)]
@@ -114,8 +140,8 @@ def associate(
     return near_a[close], near_b[close]
 
 
-def _nearest(t: Float[np.ndarray, " n"], among: Float[np.ndarray, " m"]) -> Int[np.ndarray, " n"]:
-    """Index of the nearest of increasing stamps, the earlier of two equally near."""
+def nearest(t: Float[np.ndarray, " n"], among: Float[np.ndarray, " m"]) -> Int[np.ndarray, " n"]:
+    """Index of the nearest of the increasing stamps `among`, the earlier of two equally near."""
     after = np.minimum(np.searchsorted(among, t, side="right"), len(among) - 1)
     before = np.maximum(after - 1, 0)
     return np.where(np.abs(among[after] - t) < np.abs(t - among[before]), after, before)
@@ -139,10 +165,15 @@ def _stamped(
     return Trajectory(t, T)
 
 
-def _read_numbers(
-    path: Path, columns: str, counts: tuple[int, ...], separator: str | None = None
+def read_numbers(
+    path: Path, columns: str, counts: tuple[int, ...], separator: str | None = None, finite: bool = True
 ) -> tuple[list[int], Float[np.ndarray, "n c"]]:
-    """Line numbers and the first min(counts) columns of a table; each line has one of `counts` columns."""
+    """Line numbers and the first min(counts) columns of a table; each line has one of `counts` columns.
+
+    Empty lines and those that begin with # are left out. DataError naming file and line, with `columns` for
+    what was expected, for another number of columns, for text, and for NaN or infinity unless `finite` is
+    False.
+    """
     lines, rows = [], []
     for number, line in enumerate(
         path.read_text(encoding="utf-8-sig", errors="replace").splitlines(), start=1
@@ -156,7 +187,7 @@ def _read_numbers(
             row = [float(field) for field in fields][: min(counts)]
         except ValueError:
             raise DataError(f"{path}:{number}: expected {columns}, got {line[:60]!r}") from None
-        if not all(map(math.isfinite, row)):
+        if finite and not all(map(math.isfinite, row)):
             raise DataError(f"{path}:{number}: expected finite numbers, got {line[:60]!r}")
         lines.append(number)
         rows.append(row)
@@ -195,12 +226,17 @@ def write_text(path: Path | str, text: str) -> None:
 
 
 def write_json(path: Path | str, value: Any) -> None:
-    """Write JSON atomically.
+    """Write JSON atomically; see `json_text` for what it takes."""
+    write_text(path, json_text(value) + "\n")
+
+
+def json_text(value: Any) -> str:
+    """A value as JSON.
 
     Beside what JSON knows, it takes numpy and JAX numbers and arrays, paths, dataclasses and NamedTuples (as
     objects); NaN and infinities, which JSON lacks, become null. TypeError for anything else.
     """
-    write_text(path, json.dumps(_plain(value), indent=2, allow_nan=False) + "\n")
+    return json.dumps(_plain(value), indent=2, allow_nan=False)
 
 
 def _plain(value: Any) -> Any:
@@ -209,7 +245,7 @@ def _plain(value: Any) -> Any:
         value = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
     elif isinstance(value, tuple) and hasattr(value, "_asdict"):
         value = value._asdict()  # pyright: ignore[reportAttributeAccessIssue]
-    elif isinstance(value, np.ndarray | np.generic | jax.Array):
+    elif hasattr(value, "__array__"):
         value = np.asarray(value).tolist()
     if isinstance(value, dict):
         return {str(key): _plain(item) for key, item in value.items()}
@@ -249,6 +285,8 @@ def peak_rss_bytes() -> int:
 
 def versions() -> dict[str, str]:
     """What a result depends on besides its configuration: software and device."""
+    import jax  # slow to load, and files of trajectories are read without it
+
     return {
         "python": platform.python_version(),
         "jaxpose": jaxpose.__version__,

@@ -7,7 +7,7 @@ either input carry no information: they are left out and counted, never an error
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Shaped
+from jaxtyping import Bool, Float, Int, Shaped
 
 from jaxpose.errors import DataError
 
@@ -49,11 +49,11 @@ class Ate(NamedTuple):
 
 
 class Rpe(NamedTuple):
-    """Relative pose error over a fixed number of frames: drift of translation [m] and of rotation [deg]."""
+    """Relative pose error over equal stretches: drift of translation [m] and of rotation [deg]."""
 
     translation_m: Statistics
     rotation_deg: Statistics
-    translation_errors_m: Float[np.ndarray, " p"]  # one per pair (i, i + delta), NaN where left out
+    translation_errors_m: Float[np.ndarray, " p"]  # one per pair, NaN where left out
     rotation_errors_deg: Float[np.ndarray, " p"]
     pairs: int
     skipped: int
@@ -149,23 +149,35 @@ def ate(
 def rpe(
     estimate: Float[np.ndarray, "n 4 4"],
     reference: Float[np.ndarray, "n 4 4"],
-    delta: int = 1,
+    delta: int | float = 1,
     alignment: Alignment = "se3",
+    *,
+    along: Float[np.ndarray, " n"] | None = None,
 ) -> Rpe:
     """Relative pose error over every pair of frames (i, i + delta), overlapping pairs included.
 
+    With `along`, a number for each row that never decreases, such as its stamp or the path travelled until
+    then (`path_length`), row i is paired with the later row whose number is nearest to along[i] + delta, if
+    that is at most a tenth of `delta` off.
+
     Motions relative to a frame are free of any rigid alignment, so "none" and "se3" agree; "sim3" scales the
-    estimate first. ValueError for `delta` below 1, DataError without a usable pair.
+    estimate first. ValueError for `delta` below 1 frame or not positive, DataError without a usable pair.
     """
-    if delta < 1:
+    if along is None and not (delta >= 1 and delta == int(delta)):
         raise ValueError(f"rpe: expected delta of at least 1 frame, got {delta}")
+    if not delta > 0:
+        raise ValueError(f"rpe: expected a positive delta, got {delta}")
     scale = align_trajectory(estimate, reference, "sim3").scale if alignment == "sim3" else 1.0
-    used = _usable(estimate[:-delta], reference[:-delta]) & _usable(estimate[delta:], reference[delta:])
+    frames = np.arange(float(len(estimate)))
+    first, last = _pairs(frames, delta, 0) if along is None else _pairs(along, delta, 0.1 * delta)
+    usable = _usable(estimate, reference)
+    used = usable[first] & usable[last]
     if not used.any():
+        apart = "frames apart" if along is None else "apart (within a tenth)"
         raise DataError(
-            f"relative pose error: expected two finite poses {delta} frames apart, got {len(estimate)} poses"
+            f"relative pose error: expected two finite poses {delta:g} {apart}, got {len(estimate)} poses"
         )
-    moved, truth = (_relative(T[:-delta][used], T[delta:][used]) for T in (estimate, reference))
+    moved, truth = (_relative(T[first[used]], T[last[used]]) for T in (estimate, reference))
     moved[:, :3, 3] *= scale
     translation, rotation = np.full((2, len(used)), np.nan)
     # The error's translation is this difference turned into the reference's last frame: of the same length.
@@ -173,6 +185,16 @@ def rpe(
     rotation[used] = rotation_angle_deg(moved[:, :3, :3], truth[:, :3, :3])
     pairs = int(used.sum())
     return Rpe(statistics(translation), statistics(rotation), translation, rotation, pairs, len(used) - pairs)
+
+
+def path_length(T_world_cam: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, " n"]:
+    """How far the centre has come until each row [m], straight from one finite pose to the next."""
+    finite = np.isfinite(T_world_cam).all((1, 2))
+    centres = np.asarray(T_world_cam[finite, :3, 3], np.float64)
+    steps = np.linalg.norm(np.diff(centres, axis=0, prepend=centres[:1]), axis=1)
+    come = np.zeros(len(finite))
+    come[finite] = np.cumsum(steps)
+    return np.maximum.accumulate(come)
 
 
 def procrustes(estimate: Float[np.ndarray, "n 4 4"], reference: Float[np.ndarray, "n 4 4"]) -> Similarity:
@@ -278,6 +300,19 @@ def _usable(
     if estimate.shape != reference.shape:
         raise DataError(f"trajectories: expected matched poses, got {estimate.shape} and {reference.shape}")
     return np.asarray(np.isfinite(np.concatenate([estimate, reference], -1)).all((1, 2)))
+
+
+def _pairs(
+    along: Float[np.ndarray, " n"], delta: int | float, tolerance: int | float
+) -> tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"]]:
+    """Rows and their partners about `delta` further along; of equally near ones the first."""
+    after = np.searchsorted(along, along + delta)
+    before = np.searchsorted(along, along[np.maximum(after - 1, 0)])
+    after = np.minimum(after, len(along) - 1)
+    off = [np.abs(along[partner] - along - delta) for partner in (before, after)]
+    partner = np.where(off[0] <= off[1], before, after)
+    close = (np.minimum(*off) <= tolerance) & (partner > np.arange(len(along)))
+    return np.flatnonzero(close), partner[close]
 
 
 def _relative(

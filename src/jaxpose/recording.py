@@ -30,6 +30,7 @@ class Recording(NamedTuple):
     T_body_cam: np.ndarray = np.eye(4)  # body = IMU
     gravity_world: np.ndarray = np.array([0.0, 0.0, -9.80665])  # in the frame of `T_world_cam`
     notes: tuple[str, ...] = ()  # what the loader has to tell the user
+    files: tuple[str, ...] = ()  # each colour image, relative to the recording's folder; empty: on no disk
 
 
 class Photographs(NamedTuple):
@@ -54,6 +55,7 @@ def select(recording: Recording, indices: np.ndarray) -> Recording:
         t=recording.t[indices],
         read=lambda i: recording.read(int(indices[i])),
         T_world_cam=None if poses is None else poses[indices],
+        files=tuple(recording.files[i] for i in indices) if recording.files else (),
     )
 
 

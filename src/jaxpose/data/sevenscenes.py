@@ -58,6 +58,7 @@ def load(path: Path | str, *, rate_hz: float = 30.0) -> Recording:
         read=lambda i: Frame(_read_color(frames[i].color), _read_depth(frames[i].depth)),
         T_world_cam=poses,
         notes=(*skipped, *assumed, *repaired),
+        files=tuple(str(frame.color.relative_to(path)) for frame in frames),
     )
 
 

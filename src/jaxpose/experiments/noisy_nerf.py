@@ -19,10 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxpose import io, io_checkpoint, metrics, nerf, plots_nerf
+from jaxpose import command, io, io_checkpoint, metrics, nerf, plots_nerf
 from jaxpose.data import blender
 from jaxpose.errors import DataError
-from jaxpose.experiments import command
 from jaxpose.experiments.noisy_nerf_measure import PROTOCOL, Measured, measure
 from jaxpose.experiments.noisy_nerf_options import (
     CHUNK,
@@ -37,6 +36,8 @@ from jaxpose.experiments.noisy_nerf_report import Progress, progress_bar, report
 from jaxpose.experiments.noisy_nerf_setup import Setup, build, describe, splined
 from jaxpose.experiments.noisy_nerf_studies import STUDIES
 from jaxpose.fields import set_progress
+from jaxpose.io_camera import write_camera
+from jaxpose.io_field import write_field
 from jaxpose.io_transforms import write_transforms
 from jaxpose.nerf import State, Trainer
 from jaxpose.plots_nerf import History
@@ -202,6 +203,9 @@ def _single(
     measured = measure(config, problem, setup, trained.state, T_world_cam)
     _draw(folder, config, problem, measured, trained)
     _write_poses(folder, config, problem, measured)
+    span = (float(problem.train.t[0]), float(problem.train.t[-1]))
+    factors = setup.factors(trained.state.pose)
+    write_field(folder / "field.npz", span, factors, alignment=measured.alignment)
     seconds = float(trained.history[-1, -1])
     results = {
         "experiment": "noisy_nerf",
@@ -264,6 +268,8 @@ def _write_poses(folder: Path, config: Config, problem: Problem, measured: Measu
     io.write_tum(folder / "reference.txt", io.Trajectory(photographs.t, photographs.T_world_cam))
     with io.atomic(folder / "start.npz") as temporary:
         np.savez(temporary, t=photographs.t, T_world_cam=problem.T_start)
+    images_folder = "." if config.data == ORBIT else _images_folder(config.data).resolve()
+    write_camera(folder / "camera.json", photographs.camera, photographs.files, images_folder)
     if config.data == ORBIT:  # its images are on no disk yet
         for part in (photographs, problem.held_out):
             for name, rgb in zip(part.files, part.rgb, strict=True):
@@ -275,6 +281,13 @@ def _write_poses(folder: Path, config: Config, problem: Problem, measured: Measu
         write_transforms(folder / "transforms.json", refined)
     else:
         write_transforms(folder / "transforms.json", refined, source=blender.transforms_file(config.data))
+
+
+def _images_folder(data: Path) -> Path:
+    """The folder that the names of the images are relative to."""
+    if (data / "poses_bounds.npy").is_file():
+        return data
+    return blender.transforms_file(data).parent
 
 
 def _title(problem: Problem) -> str:

@@ -11,7 +11,7 @@ from jaxpose import metrics, nerf
 from jaxpose.experiments.noisy_nerf_options import Config, Problem
 from jaxpose.experiments.noisy_nerf_setup import Setup
 from jaxpose.fields import set_progress
-from jaxpose.metrics import PoseErrors
+from jaxpose.metrics import PoseErrors, Similarity
 from jaxpose.metrics_image import lpips, ssim
 from jaxpose.nerf import State, Viewer
 from jaxpose.plots_nerf import HeldOut
@@ -35,6 +35,7 @@ class Measured(NamedTuple):
     views: list[HeldOut]
     T_start: Float[np.ndarray, "n 4 4"]
     T_estimate: Float[np.ndarray, "n 4 4"]
+    alignment: Similarity  # of the latter
 
 
 def pose_numbers(errors: PoseErrors, extent: float) -> dict[str, float]:
@@ -90,6 +91,7 @@ def measure(
         views,
         metrics.align(at_start.alignment, problem.T_start),
         metrics.align(errors.alignment, T_world_cam),
+        errors.alignment,
     )
 
 

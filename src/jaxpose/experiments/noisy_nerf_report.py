@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from jaxpose.experiments.command import markdown_table, step_bar
+from jaxpose.command import markdown_table, step_bar
 
 _COLUMNS: tuple[str, ...] = (
     "run", "RE [deg]", "TE [units]", "TE [%]", "centres [%]", "PSNR [dB]", "SSIM", "LPIPS", "train [s]",

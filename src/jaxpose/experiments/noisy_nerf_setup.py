@@ -1,7 +1,9 @@
 """What is trained in the noisy-pose experiment: scene, pose field, their rates, by preset and name."""
 
 import warnings
+from collections.abc import Callable
 from dataclasses import asdict, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -12,7 +14,8 @@ from scipy.interpolate import make_splrep
 
 from jaxpose import fields
 from jaxpose.experiments.noisy_nerf_options import CHUNK, Config, Problem
-from jaxpose.fields import PoseField, PoseNetConfig
+from jaxpose.fields import Params, PoseField, PoseNetConfig
+from jaxpose.io_field import Factor, bspline_factor, posenet_factor, stamped_factor, table_factor
 from jaxpose.nerf import Depths, Rate, TrainConfig, Views
 from jaxpose.scenes import NerfConfig, SceneField, nerf
 
@@ -46,6 +49,7 @@ class Setup(NamedTuple):
 
     scene: SceneField
     field: PoseField
+    factors: Callable[[Params], tuple[Factor, ...]]  # of the field, for `io_field.write_field`
     scene_rates: Rate
     pose_rates: Any
     train: TrainConfig
@@ -68,11 +72,14 @@ def build(config: Config, problem: Problem) -> Setup:
     else:
         scene_rates = Rate(5e-4, 1e-4) if barf == "depth" else Rate(1e-3, 1e-4)
     t = jnp.asarray(photographs.t, jnp.float32)
-    field, rates = _field(config, problem)
-    initial = fields.stamped(t, jnp.asarray(problem.T_start, jnp.float32))
+    field, factor, rates = _field(config, problem)
+    T_start = jnp.asarray(problem.T_start, jnp.float32)
+    start = stamped_factor(t, T_start)
+    world = config.side == "world"
     return Setup(
         scene,
-        fields.refine(field, initial, side="world" if config.side == "world" else "body"),
+        fields.refine(field, fields.stamped(t, T_start), side="world" if world else "body"),
+        lambda params: (factor(params), start) if world else (start, factor(params)),
         scene_rates,
         rates,
         train,
@@ -123,8 +130,8 @@ def describe(config: Config, setup: Setup) -> dict[str, Any]:
     }
 
 
-def _field(config: Config, problem: Problem) -> tuple[PoseField, Any]:
-    """The correction of the poses by itself, and its rates."""
+def _field(config: Config, problem: Problem) -> tuple[PoseField, Callable[[Params], Factor], Any]:
+    """The correction of the poses by itself, as a field and as a factor of its file, and its rates."""
     photographs, paper = problem.train, config.preset == "paper"
     span = (float(photographs.t[0]), float(photographs.t[-1]))
     shift_from, turn_from = (0.0, 0.0) if paper else (_SHIFT_FROM, _TURN_FROM)
@@ -134,22 +141,26 @@ def _field(config: Config, problem: Problem) -> tuple[PoseField, Any]:
         # nearest depth, which is the unit of LLFF's scenes.
         scale = photographs.near if config.noise == "unknown" else problem.extent / 2
         net = replace(config.net, layers=2, width=32) if config.smoke else config.net
-        field = fields.posenet(PoseNetConfig(span=span, translation_scale=scale, **asdict(net)))
+        posenet = PoseNetConfig(span=span, translation_scale=scale, **asdict(net))
+        factor = partial(posenet_factor, posenet)
         shift, turn = _NET_RATES["paper" if paper else start]
         rates = {"translation": Rate(*shift, shift_from), "rotation": Rate(*turn, turn_from)}
         if config.net.coupled:
             rates = {"coupled": rates["rotation"]}
-        return field, rates if config.net.window is None else rates | {"progress": Rate(1.0, 1.0)}
+        rates = rates if config.net.window is None else rates | {"progress": Rate(1.0, 1.0)}
+        return fields.posenet(posenet), factor, rates
     if paper:
         shift = turn = (3e-3 if photographs.spacing == "disparity" else 1e-3, 1e-5)
     else:
         shift, turn = _TABLE_RATES[start]
     if config.pose == "bspline":
         field, columns = fields.bspline(span, config.spline_knots), (3, 4)
+        factor = partial(bspline_factor, span)
     else:
         field, columns = fields.table(photographs.t), (3, 3)
+        factor = partial(table_factor, photographs.t)
     pairs = zip((*shift, shift_from), (*turn, turn_from), strict=True)
-    return field, Rate(*(np.repeat(pair, columns)[None] for pair in pairs))
+    return field, factor, Rate(*(np.repeat(pair, columns)[None] for pair in pairs))
 
 
 def _fast_scene(config: Config) -> NerfConfig:

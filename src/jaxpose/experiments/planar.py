@@ -17,8 +17,8 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib import cbook
 
-from jaxpose import io, plots_planar
-from jaxpose.experiments import command, planar_fit, planar_task
+from jaxpose import command, io, plots_planar
+from jaxpose.experiments import planar_fit, planar_task
 from jaxpose.experiments.planar_fit import CHUNK, Aligned, Aligner
 from jaxpose.experiments.planar_report import (
     SUCCESS_PX,

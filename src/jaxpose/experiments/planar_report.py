@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxpose.experiments.command import markdown_table, step_bar
+from jaxpose.command import markdown_table, step_bar
 from jaxpose.experiments.planar_task import PATCHES, PROTOCOL, Photo
 from jaxpose.experiments.planar_warps import RESET_EVERY, SPLINE_KNOTS, Warps
 

@@ -10,7 +10,8 @@ from typing import Annotated
 
 import tyro
 
-from jaxpose.experiments import command, slam_run
+from jaxpose import command
+from jaxpose.experiments import slam_run
 from jaxpose.experiments.slam_options import Options
 from jaxpose.experiments.slam_report import progress_bar, report
 from jaxpose.slam.run import SlamConfig

@@ -8,7 +8,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from jaxpose.experiments.command import markdown_table
+from jaxpose.command import markdown_table
 from jaxpose.slam.run import ImuMode, Progress
 
 _COLUMNS: tuple[str, ...] = ("IMU", "ATE [cm]", "RPE [cm]", "RPE [deg]", "frames lost", "s / frame")

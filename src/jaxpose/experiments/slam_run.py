@@ -13,10 +13,13 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxpose import io, plots
+from jaxpose.errors import DataError
 from jaxpose.experiments.slam_measure import Accuracy, Inertial, accuracy, cost, inertial, views
 from jaxpose.experiments.slam_options import Options, Source, load, slam_config
 from jaxpose.experiments.slam_report import table
 from jaxpose.fields import Params, PoseField, bspline
+from jaxpose.io_camera import write_camera
+from jaxpose.io_field import bspline_factor, write_field
 from jaxpose.recording import Recording
 from jaxpose.slam.run import ImuMode, Progress, SlamResult
 from jaxpose.slam.run import run as track
@@ -118,7 +121,10 @@ def _single(
     io.write_tum(folder / "trajectory.txt", io.Trajectory(recording.t, result.T_world_cam))
     if truth is not None:
         io.write_tum(folder / "reference.txt", io.Trajectory(recording.t, truth))
-    _save_field(folder / "field.npz", recording, result)
+    span = (0.0, float(recording.t[-1] - recording.t[0]))
+    write_field(folder / "field.npz", span, [bspline_factor(span, result.field_params)])
+    images_folder = "." if options.data is None else options.data.resolve()
+    write_camera(folder / "camera.json", recording.camera, recording.files, images_folder)
     io.write_json(folder / "config.json", options)
     results |= {
         "notes": recording.notes,
@@ -157,18 +163,15 @@ def _draw(
         plots.inertial(folder / "inertial.png", motion.t, motion.gyro, motion.accelerometer, title)
 
 
-def _save_field(path: Path, recording: Recording, result: SlamResult) -> None:
-    """The final field: the control poses of its B-spline and the time they span [s]."""
-    with io.atomic(path) as temporary:
-        span = recording.t[[0, -1]] - recording.t[0]
-        np.savez(temporary, control_points=np.asarray(result.field_params), span=span)
-
-
 def load_field(folder: Path | str) -> tuple[PoseField, Params]:
     """The trajectory of a run folder as a field and its parameters: `field.pose(params, t)` is T_world_cam.
 
-    `t` is in seconds on the clock of `trajectory.txt`, anywhere between its first and last.
+    `t` is in seconds on the clock of `trajectory.txt`, anywhere between its first and last. DataError for the
+    folder of no SLAM run, or of one of before version 1 of the file (`io_field`).
     """
-    with np.load(Path(folder) / "field.npz") as file:
-        params, (first, last) = jnp.asarray(file["control_points"], jnp.float32), file["span"]
+    path = Path(folder) / "field.npz"
+    with np.load(path) as file:
+        if "0.control_points" not in file:
+            raise DataError(f"{path}: expected a B-spline in a trajectory of version 1, got neither")
+        params, (first, last) = jnp.asarray(file["0.control_points"], jnp.float32), file["0.span"]
     return bspline((float(first), float(last)), params.shape[0] - 3), params

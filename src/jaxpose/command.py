@@ -1,4 +1,4 @@
-"""What every experiment's command does: options to a config, known errors to one line, bars, tables."""
+"""What every command does: options to a config, known errors to one line, bars, tables."""
 
 import io
 import json
@@ -18,18 +18,23 @@ Config = TypeVar("Config")
 
 
 def parse(
-    name: str, config_type: Callable[..., Config], description: str | None, args: Sequence[str] | None = None
+    name: str,
+    config_type: Callable[..., Config],
+    description: str | None,
+    args: Sequence[str] | None = None,
+    *,
+    prog: str | None = None,
 ) -> Config:
     """The config that the command line asks for; exits with one line and code 1 if it asks for what is not.
 
-    `--help` prints and exits with 0, as usual.
+    `--help` prints and exits with 0, as usual; there the command is called `prog`, by default that of an
+    experiment.
     """
+    prog = prog or f"python -m jaxpose.experiments.{name}"
     complaint = io.StringIO()
     try:
         with redirect_stderr(complaint):
-            return tyro.cli(
-                config_type, prog=f"python -m jaxpose.experiments.{name}", description=description, args=args
-            )
+            return tyro.cli(config_type, prog=prog, description=description, args=args)
     except SystemExit as stop:
         if not stop.code:
             raise
