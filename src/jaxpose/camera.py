@@ -56,7 +56,11 @@ def scale(camera: Camera, factor: float) -> Camera:
 
     Resizing keeps the image's outer edge, half a pixel outside the first centre: u' = (u + 0.5) s - 0.5.
     """
-    width, height = round(camera.width * factor), round(camera.height * factor)
+    return resized(camera, round(camera.width * factor), round(camera.height * factor))
+
+
+def resized(camera: Camera, width: int, height: int) -> Camera:
+    """The camera of the image resized to exactly this size, as `scale` says."""
     sx, sy = width / camera.width, height / camera.height
     return camera._replace(
         fx=camera.fx * sx,

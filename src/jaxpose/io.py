@@ -36,14 +36,15 @@ class Trajectory(NamedTuple):
 # --- trajectories ---------------------------------------------------------------------------------------
 
 
-def read_tum(path: Path | str) -> Trajectory:
+def read_tum(path: Path | str, *, first_of_equal: bool = False) -> Trajectory:
     """Read a TUM trajectory: lines of `t tx ty tz qx qy qz qw`, `#` comments; quaternions are normalised.
 
     DataError naming file and line for a wrong number of columns, text or NaN where a number belongs, a zero
-    quaternion, or stamps that repeat or go backwards; FileNotFoundError as usual.
+    quaternion, or stamps that repeat or go backwards; FileNotFoundError as usual. With `first_of_equal` the
+    first of poses with the same stamp, which real truth has, is kept.
     """
     lines, values = read_numbers(Path(path), _TUM_COLUMNS, counts=(8,))
-    return _stamped(Path(path), lines, values[:, 0], values[:, 1:4], values[:, 4:])
+    return _stamped(Path(path), lines, values[:, 0], values[:, 1:4], values[:, 4:], first_of_equal)
 
 
 def write_tum(path: Path | str, trajectory: Trajectory) -> None:
@@ -79,13 +80,14 @@ def write_kitti(path: Path | str, T_world_cam: Float[np.ndarray, "n 4 4"]) -> No
     write_text(path, _lines(T_world_cam[:, :3].reshape(-1, 12)))
 
 
-def read_euroc(path: Path | str) -> Trajectory:
+def read_euroc(path: Path | str, *, first_of_equal: bool = False) -> Trajectory:
     """Read EuRoC or TUM-VI truth (csv: stamp [ns], position, quaternion wxyz, ...): T_world_body.
 
     Stamps become float64 seconds since 1970, which resolves 0.24 microseconds. DataError as `read_tum`.
     """
     lines, values = read_numbers(Path(path), _EUROC_COLUMNS, counts=(17, 8), separator=",")
-    return _stamped(Path(path), lines, values[:, 0] / 1e9, values[:, 1:4], values[:, [5, 6, 7, 4]])
+    quaternion_xyzw = values[:, [5, 6, 7, 4]]
+    return _stamped(Path(path), lines, values[:, 0] / 1e9, values[:, 1:4], quaternion_xyzw, first_of_equal)
 
 
 def write_euroc(path: Path | str, trajectory: Trajectory) -> None:
@@ -153,10 +155,15 @@ def _stamped(
     t: Float[np.ndarray, " n"],
     translation: Float[np.ndarray, "n 3"],
     quaternion_xyzw: Float[np.ndarray, "n 4"],
+    first_of_equal: bool,
 ) -> Trajectory:
     """A trajectory from columns, their values checked."""
     for row in np.flatnonzero(np.linalg.norm(quaternion_xyzw, axis=1) < 1e-6):
         raise DataError(f"{path}:{lines[row]}: expected a unit quaternion, got zero")
+    if first_of_equal:
+        kept = np.append(True, np.diff(t) != 0)
+        lines = [line for line, keep in zip(lines, kept, strict=True) if keep]
+        t, translation, quaternion_xyzw = t[kept], translation[kept], quaternion_xyzw[kept]
     for row in np.flatnonzero(np.diff(t) <= 0) + 1:
         raise DataError(f"{path}:{lines[row]}: expected a stamp after {t[row - 1]!s} s, got {t[row]!s} s")
     T = np.tile(np.eye(4), (len(t), 1, 1))

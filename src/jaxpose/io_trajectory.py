@@ -23,14 +23,15 @@ class Found(NamedTuple):
     trajectory: Trajectory
     format: Format
     stamped: bool
+    repeated: int  # poses left out, as their stamp is that of the pose before
 
 
 def read_trajectory(path: Path | str) -> Found:
     """Read a trajectory file, its format found by the separator and the number of columns of its first line.
 
     TUM: `t tx ty tz qx qy qz qw`; EuRoC and TUM-VI: csv of stamp [ns], position, quaternion wxyz; KITTI: 12
-    numbers, the rows of a 3x4 pose; 4x4 lists: 16 numbers a line or 4 lines of 4. DataError naming file and
-    line for what is none of them or is damaged.
+    numbers, the rows of a 3x4 pose; 4x4 lists: 16 numbers a line or 4 lines of 4. Of poses with the same
+    stamp the first is kept. DataError naming file and line for what is none of them or is damaged.
     """
     path = Path(path)
     content = _lines(path)
@@ -38,14 +39,16 @@ def read_trajectory(path: Path | str) -> Found:
         raise DataError(f"{path}: expected a trajectory, {_KNOWN}, got no line of numbers")
     number, line = content[0]
     if "," in line:
-        return Found(io.read_euroc(path), "EuRoC", True)
+        trajectory = io.read_euroc(path, first_of_equal=True)
+        return Found(trajectory, "EuRoC", True, len(content) - len(trajectory.t))
     columns = len(line.split())
     if columns == 8:
-        return Found(io.read_tum(path), "TUM", True)
+        trajectory = io.read_tum(path, first_of_equal=True)
+        return Found(trajectory, "TUM", True, len(content) - len(trajectory.t))
     if columns == 12:
-        return Found(io.read_kitti(path, rate_hz=1.0), "KITTI", False)
+        return Found(io.read_kitti(path, rate_hz=1.0), "KITTI", False, 0)
     if columns in (4, 16):
-        return Found(_read_matrices(path, columns), "4x4 list", False)
+        return Found(_read_matrices(path, columns), "4x4 list", False, 0)
     raise DataError(f"{path}:{number}: expected a trajectory, {_KNOWN}, got {line[:60]!r}")
 
 

@@ -171,7 +171,7 @@ def rpe(
     frames = np.arange(float(len(estimate)))
     first, last = _pairs(frames, delta, 0) if along is None else _pairs(along, delta, 0.1 * delta)
     usable = _usable(estimate, reference)
-    used = usable[first] & usable[last]
+    used = np.logical_and(usable[first], usable[last])
     if not used.any():
         apart = "frames apart" if along is None else "apart (within a tenth)"
         raise DataError(
@@ -192,7 +192,7 @@ def path_length(T_world_cam: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, " 
     finite = np.isfinite(T_world_cam).all((1, 2))
     centres = np.asarray(T_world_cam[finite, :3, 3], np.float64)
     steps = np.linalg.norm(np.diff(centres, axis=0, prepend=centres[:1]), axis=1)
-    come = np.zeros(len(finite))
+    come = np.zeros(len(T_world_cam))
     come[finite] = np.cumsum(steps)
     return np.maximum.accumulate(come)
 
@@ -309,7 +309,7 @@ def _pairs(
     after = np.searchsorted(along, along + delta)
     before = np.searchsorted(along, along[np.maximum(after - 1, 0)])
     after = np.minimum(after, len(along) - 1)
-    off = [np.abs(along[partner] - along - delta) for partner in (before, after)]
+    off = [np.asarray(np.abs(along[partner] - along - delta)) for partner in (before, after)]
     partner = np.where(off[0] <= off[1], before, after)
     close = (np.minimum(*off) <= tolerance) & (partner > np.arange(len(along)))
     return np.flatnonzero(close), partner[close]

@@ -1,0 +1,34 @@
+"""Camera trajectories: compare them, take them out of a run.
+
+`jaxpose COMMAND --help` tells what a command takes. The experiments that make runs are
+`python -m jaxpose.experiments.rgbd_slam`, `imu_slam`, `noisy_nerf` and `planar`.
+"""
+
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+import tyro
+
+from jaxpose import command
+from jaxpose.commands import evaluate, export
+from jaxpose.io import json_text
+
+_MODULES = {evaluate.Config: ("eval", evaluate), export.Config: ("export", export)}
+# All that the command line can ask for: the config of one of the commands.
+_Command = Annotated[
+    Annotated[evaluate.Config, tyro.conf.subcommand("eval", description=evaluate.__doc__)]
+    | Annotated[export.Config, tyro.conf.subcommand("export", description=export.__doc__)],
+    tyro.conf.FlagCreatePairsOff,
+]
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """The command: `jaxpose`, or `python -m jaxpose`."""
+    config: Any = command.parse("jaxpose", _Command, __doc__, args, prog="jaxpose")  # pyright: ignore
+    name, module = _MODULES[type(config)]
+
+    def said() -> str:
+        result = module.run(config)
+        return json_text(result) if config.json else module.report(result)
+
+    command.guarded(f"jaxpose {name}", said)

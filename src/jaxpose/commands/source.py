@@ -1,0 +1,63 @@
+"""What a command is given: a trajectory file of any format, or the folder of a run."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxpose import io, io_trajectory, numpy_field
+from jaxpose.errors import DataError
+
+FIELD = "field.npz"
+
+
+class Source(NamedTuple):
+    """Poses, and what they were read from."""
+
+    path: Path
+    what: str  # in words
+    trajectory: io.Trajectory
+    stamped: bool  # False: pose i is said to be at i seconds
+    is_run: bool
+
+    def __str__(self) -> str:
+        t = self.trajectory.t
+        span = f", {t[0]:.3f} to {t[-1]:.3f} s" if self.stamped else ", no stamps"
+        return f"{self.path}  {self.what}, {len(t)} poses{span}"
+
+
+def read_source(path: Path) -> Source:
+    """Read a trajectory file or the trajectory of a run folder; DataError or OSError for what is neither."""
+    if not path.is_dir():
+        if not path.exists():
+            raise DataError(f"{path}: expected a trajectory file or a run folder, got nothing")
+        trajectory, name, stamped, repeated = io_trajectory.read_trajectory(path)
+        what = f"{name} file" + (f" ({repeated} left out: same stamp as before)" if repeated else "")
+        return Source(path, what, trajectory, stamped, False)
+    file = path / "trajectory.txt"
+    if not file.is_file():
+        inner = sorted(folder.parent.name for folder in path.glob("*/trajectory.txt"))
+        hint = f"runs in it: {', '.join(inner)}" if inner else "none"
+        raise DataError(f"{path}: expected a run folder with trajectory.txt, got {hint}")
+    results = path / "results.json"
+    name = json.loads(results.read_text()).get("experiment", "") if results.is_file() else ""
+    return Source(path, f"{name} run".strip(), io.read_tum(file), True, True)
+
+
+def read_field(source: Source) -> Callable[[Float[np.ndarray, " n"]], Float[np.ndarray, "n 4 4"]]:
+    """The continuous trajectory of a run; DataError where there is none, as motion is not made up."""
+    if not source.is_run:
+        raise DataError(
+            f"{source.path}: expected a run folder with {FIELD}, got a {source.what}: how it moved between "
+            "its stamps is not known"
+        )
+    file = source.path / FIELD
+    if not file.is_file():
+        raise DataError(f"{file}: expected the continuous trajectory of the run, got nothing")
+    try:
+        return numpy_field.load(file)
+    except ValueError as error:
+        raise DataError(f"{error}: runs of before it was written need to be run again") from None
