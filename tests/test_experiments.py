@@ -13,11 +13,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from jaxpose import io, metrics
+from jaxpose import io, metrics, numpy_field
 from jaxpose.data.synthetic import RoomConfig, room
+from jaxpose.errors import DataError
 from jaxpose.experiments import imu_slam, rgbd_slam, slam_run
 from jaxpose.experiments.slam_options import load
 from jaxpose.experiments.slam_report import report, table
+from jaxpose.io_camera import read_camera
 from jaxpose.recording import Recording
 
 README = Path(__file__).parents[1] / "README.md"
@@ -103,8 +105,20 @@ def test_a_saved_field_gives_the_trajectory_at_any_time(finished):
     poses = np.asarray(jax.vmap(field.pose, (None, 0))(params, jnp.asarray(estimate.t, jnp.float32)))
     distance = np.linalg.norm(poses[:, :3, 3] - estimate.T[:, :3, 3], axis=1)
     assert np.sqrt(np.mean(distance**2)) == pytest.approx(results["field_rmse_m"], abs=1e-5)
-    between = np.asarray(field.pose(params, jnp.float32(0.1)))
-    assert np.isfinite(between).all()
+    times = np.linspace(0, estimate.t[-1], 50).astype(np.float32)
+    poses = np.asarray(jax.vmap(field.pose, (None, 0))(params, jnp.asarray(times)))
+    np.testing.assert_allclose(numpy_field.load(folder / "field.npz")(times), poses, atol=1e-6)
+
+
+def test_a_field_of_before_is_refused(tmp_path):
+    np.savez(tmp_path / "field.npz", control_points=np.zeros((5, 7)), span=np.zeros(2))
+    with pytest.raises(DataError, match="field.npz: expected a B-spline in a trajectory of version 1"):
+        slam_run.load_field(tmp_path)
+
+
+def test_a_run_says_what_camera_it_had(finished):
+    camera, images, _ = read_camera(finished.folder / "camera.json")
+    assert (camera.width, camera.height, images) == (80, 60, ())
 
 
 def test_report_states_numbers_with_their_protocol(finished):
@@ -124,6 +138,11 @@ def test_rgbd_slam_on_a_folder(folder, tmp_path, capsys):
     results = json.loads((out / "results.json").read_text())
     assert results["ate_rmse_m"] < 0.02
     assert results["imu"] == {"mode": "none", "readings": "not used"}
+    camera, images, where = read_camera(out / "camera.json")
+    assert images == tuple(f"frame-{k:06d}.color.png" for k in range(FRAMES)) and (camera.width, where) == (
+        80,
+        folder,
+    )
 
 
 def test_compare_runs_every_mode(finished, tmp_path, monkeypatch, recording):

@@ -15,13 +15,15 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.interpolate import splrep
 
-from jaxpose import io, metrics
+from jaxpose import io, metrics, numpy_field
 from jaxpose.data import blender
 from jaxpose.experiments import noisy_nerf
 from jaxpose.experiments.noisy_nerf_options import Config, NetConfig, load
 from jaxpose.experiments.noisy_nerf_report import report, table
 from jaxpose.experiments.noisy_nerf_setup import _SMOKE, build, splined
 from jaxpose.experiments.noisy_nerf_studies import STUDIES
+from jaxpose.io_camera import read_camera
+from jaxpose.io_field import write_field
 
 FILES = {
     "config.json", "settings.json", "results.json", "checkpoint.npz", "start.npz", "trajectory.txt",
@@ -95,6 +97,33 @@ def test_every_field_starts_at_the_noisy_poses(pose):
     setup = build(config, problem)
     poses = noisy_nerf.pose_reader(setup)(setup.field.init(jax.random.key(0)))
     assert_allclose(poses, problem.T_start, atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"pose": "table", "side": "camera"},
+        {"pose": "spline_reset"},
+        {"pose": "bspline", "side": "camera"},
+        {"net": NetConfig(window=(0.1, 0.6))},
+        {"net": NetConfig(coupled=True, activation="softplus"), "side": "camera"},
+    ],
+    ids=["table", "spline_reset", "bspline", "window", "coupled"],
+)
+def test_every_field_is_a_file_for_numpy(tmp_path, changes):
+    """To what float32 leaves of a field over 8 scene units; `test_io_field` holds them to 1e-9 in float64."""
+    config = smoke(noise_rotation_deg=20.0, **changes)
+    problem = load(config)
+    setup = build(config, problem)
+    leaves, tree = jax.tree.flatten(setup.field.init(jax.random.key(0)))
+    rng = np.random.default_rng(0)
+    leaves = [leaf + jnp.asarray(0.1 * rng.normal(size=leaf.shape), leaf.dtype) for leaf in leaves]
+    params = jax.tree.unflatten(tree, leaves)
+    span = (float(problem.train.t[0]), float(problem.train.t[-1]))
+    write_field(tmp_path / "field.npz", span, setup.factors(params))
+    t = np.linspace(span[0] - 0.1, span[1] + 0.1, 41).astype(np.float32)
+    poses = np.asarray(jax.jit(jax.vmap(setup.field.pose, (None, 0)))(params, jnp.asarray(t)))
+    assert_allclose(numpy_field.load(tmp_path / "field.npz")(t), poses, atol=1e-5)
 
 
 def test_a_table_reset_to_a_spline():
@@ -214,6 +243,12 @@ def test_what_a_run_leaves(tmp_path):
     assert metrics.pose_errors(poses, reference.T).rotation_deg == pytest.approx(
         errors.rotation_deg, rel=1e-4
     )
+    t = np.linspace(0, problem.train.t[-1], 30).astype(np.float32)
+    anywhere = jax.jit(jax.vmap(loaded.setup.field.pose, (None, 0)))(loaded.state.pose, jnp.asarray(t))
+    aligned = metrics.align(metrics.procrustes(poses, reference.T), np.asarray(anywhere, np.float64))
+    assert_allclose(numpy_field.load(outcome.folder / "field.npz")(t), aligned, atol=3e-5)
+    camera, images, folder = read_camera(outcome.folder / "camera.json")
+    assert camera == problem.train.camera and images == problem.train.files and folder == outcome.folder
     density, _ = loaded.setup.scene.query(loaded.state.scene, jnp.zeros(3), jnp.ones(3))
     assert np.isfinite(density) and float(loaded.state.scene["progress"]) == 1
     assert results["settled"]["psnr"] > 0 and results["wall_s"] > 0 and results["versions"]["jax"]

@@ -1,6 +1,7 @@
 """What a command is given: a trajectory file of any format, or the folder of a run."""
 
 import json
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -59,5 +60,6 @@ def read_field(source: Source) -> Callable[[Float[np.ndarray, " n"]], Float[np.n
         raise DataError(f"{file}: expected the continuous trajectory of the run, got nothing")
     try:
         return numpy_field.load(file)
-    except ValueError as error:
-        raise DataError(f"{error}: runs of before it was written need to be run again") from None
+    except (ValueError, EOFError, zipfile.BadZipFile) as error:
+        found = " ".join(str(error).split()).removeprefix(f"{file}: ")
+        raise DataError(f"{file}: {found} (what older runs left needs a new run)") from None
