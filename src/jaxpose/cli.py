@@ -1,22 +1,28 @@
-"""Camera trajectories: compare them, take them out of a run.
+"""Camera trajectories: find a field that carries them, compare them, take them out of a run.
 
 `jaxpose COMMAND --help` tells what a command takes. The experiments that make runs are
 `python -m jaxpose.experiments.rgbd_slam`, `imu_slam`, `noisy_nerf` and `planar`.
 """
 
+import sys
 from collections.abc import Sequence
 from typing import Annotated, Any
 
 import tyro
 
 from jaxpose import command
-from jaxpose.commands import evaluate, export
+from jaxpose.commands import evaluate, export, fit
 from jaxpose.io import json_text
 
-_MODULES = {evaluate.Config: ("eval", evaluate), export.Config: ("export", export)}
+_MODULES = {
+    fit.Config: ("fit", fit),
+    evaluate.Config: ("eval", evaluate),
+    export.Config: ("export", export),
+}
 # All that the command line can ask for: the config of one of the commands.
 _Command = Annotated[
-    Annotated[evaluate.Config, tyro.conf.subcommand("eval", description=evaluate.__doc__)]
+    Annotated[fit.Config, tyro.conf.subcommand("fit", description=fit.__doc__)]
+    | Annotated[evaluate.Config, tyro.conf.subcommand("eval", description=evaluate.__doc__)]
     | Annotated[export.Config, tyro.conf.subcommand("export", description=export.__doc__)],
     tyro.conf.FlagCreatePairsOff,
 ]
@@ -28,7 +34,12 @@ def main(args: Sequence[str] | None = None) -> None:
     name, module = _MODULES[type(config)]
 
     def said() -> str:
-        result = module.run(config)
+        progress = {"on_field": _tell} if module is fit else {}
+        result = module.run(config, **progress)
         return json_text(result) if config.json else module.report(result)
 
     command.guarded(f"jaxpose {name}", said)
+
+
+def _tell(field: str) -> None:
+    print(f"fitting {field}", file=sys.stderr)
