@@ -108,7 +108,7 @@ def test_readings_are_explained_to_their_noise(result):
     assert inertial.omega_rms < 1.5 * sensor.stated[0]
     assert inertial.samples == sensor.readings == 3797  # of 4000: from 1 s to the last pose at 19.98 s
     assert np.abs(inertial.gyro_bias - GYRO_BIAS).max() < 1e-3
-    assert np.abs(inertial.gravity_world - TILT.apply([0, 0, -9.81])).max() < 0.05
+    assert np.abs(inertial.gravity_world - TILT.apply([0, 0, -9.81])).max() < 0.1
     assert any("203 of 4000 inertial readings" in note for note in result.notes)
 
 
@@ -131,26 +131,23 @@ def test_the_report_and_its_json(result, recording, capsys):
     text = fit.report(result)
     assert "| B-spline 10 knots/s |" in text and re.search(r"best +\|", text) and "too slow" in text
     assert "95% of the power" in text and "every tenth" in text and "biases and gravity fitted" in text
-    cli.main(
-        [
-            "fit",
-            str(recording / "truth.txt"),
-            "--posenet-octaves",
-            "--bspline-hz",
-            "2",
-            "--steps",
-            "9",
-            "--json",
-        ]
-    )
+    tiny = ["--posenet-octaves", "0", "--posenet-layers", "1", "--bspline-hz", "--steps", "9"]
+    cli.main(["fit", str(recording / "truth.txt"), *tiny, "--json"])
     said = json.loads(capsys.readouterr().out)
-    assert said["best"] == "B-spline 2 knots/s" and said["fields"][0]["rotation_deg"]["median"] > 0
+    assert said["best"] == "PoseNet F=0 1x256" and said["fields"][0]["rotation_deg"]["median"] > 0
 
 
 def test_formats_without_stamps_need_a_rate(tmp_path):
     t = np.arange(0, 10, 0.1)
     io.write_kitti(tmp_path / "kitti.txt", poses(t))
-    config = Config(tmp_path / "kitti.txt", rate_hz=10.0, posenet_octaves=(), bspline_hz=(4.0, 8.0), steps=9)
+    config = Config(
+        tmp_path / "kitti.txt",
+        rate_hz=10.0,
+        posenet_octaves=(0,),
+        posenet_layers=1,
+        bspline_hz=(8.0,),
+        steps=9,
+    )
     result = fit.run(config)
     assert result.span_s == pytest.approx(9.9) and len(result.fields) == 1
     assert any("no B-spline of 8 knots/s" in note for note in result.notes)

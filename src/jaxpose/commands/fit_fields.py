@@ -23,6 +23,7 @@ from jaxpose.motion import motion
 
 _SHARE = 0.95  # of the power of the speeds, below what is called the motion's bandwidth
 _NOISY = 0.8  # share of the highest frequency from where on poses are taken to hold nothing but noise
+_BIAS_WEIGHT = 1e-3  # of a square m/s^2 of bias beside one of a reading
 _NET_RATE, _SPLINE_RATE = 1e-3, 3e-3  # Adam's, at first
 
 
@@ -205,11 +206,15 @@ def _inertial(field: PoseField, params: Any, around: Frame, imu: Imu) -> Inertia
     R = np.asarray(moved.pose[:, :3, :3], np.float64)
     omega = np.asarray(moved.omega_body, np.float64) - np.asarray(imu.omega_body)
     free = around.scale * np.einsum("nji,nj->ni", R, np.asarray(moved.acceleration_world, np.float64))
-    # reading = R^T (a - g) + bias: linear in gravity and bias, which poses alone do not tell.
+    # reading = R^T (a - g) + bias: linear in gravity and bias. A turn about one axis does not tell them
+    # apart along it; the bias is then taken to be the smaller one.
     count = len(omega)
     design = np.concatenate([-np.swapaxes(R, 1, 2), np.tile(np.eye(3), (count, 1, 1))], axis=2).reshape(-1, 6)
     wanted = (np.asarray(imu.acceleration_body) - free).reshape(-1)
-    solution = np.linalg.lstsq(design, wanted, rcond=None)[0]
+    small_bias = np.sqrt(count) * _BIAS_WEIGHT * np.eye(3, 6, k=3)
+    solution = np.linalg.lstsq(
+        np.concatenate([design, small_bias]), np.concatenate([wanted, np.zeros(3)]), rcond=None
+    )[0]
     left = wanted - design @ solution
     bias = -omega.mean(0)
     return Inertial(
