@@ -213,7 +213,7 @@ def test_the_table(files, capsys, tmp_path):
     ].strip() == "m"
     assert "57 of 59 poses of the shorter one: nearest stamps" in text and "TUM file, 59 poses" in text
     assert "SE(3)" in text and "RPE over 0.5 m" in text and "RPE over 1 frame " in text
-    assert "RPE over 100 m: no two poses are so far apart" in text and str(plot) in text
+    assert "RPE over 100 m: no two poses are that far apart, to a tenth" in text and str(plot) in text
     with Image.open(plot) as image:
         pixels = np.asarray(image.convert("RGB"))
     assert image.format == "PNG" and len(np.unique(pixels.reshape(-1, 3), axis=0)) > 100
@@ -231,6 +231,9 @@ def test_wrong_calls_cost_one_line(files, tmp_path):
     (tmp_path / "folder" / "none").mkdir(parents=True)
     io.write_tum(tmp_path / "folder" / "none" / "trajectory.txt", paths()[0])
     io.write_kitti(tmp_path / "kitti.txt", paths(10)[0].T)
+    (tmp_path / "broken").mkdir()
+    io.write_tum(tmp_path / "broken" / "trajectory.txt", paths()[0])
+    (tmp_path / "broken" / "results.json").write_text("{")
     for args, message in (
         ([], "jaxpose: Expected one of .eval, export"),
         (["evaluate"], "eval"),
@@ -244,6 +247,8 @@ def test_wrong_calls_cost_one_line(files, tmp_path):
         (["eval", tmp_path / "kitti.txt", truth], "kitti.txt: expected 60 poses, as .*, got 10"),
         (["eval", truth, truth, "--match", "exact"], "expected a run folder with field.npz, got a TUM file"),
         (["eval", truth, truth, "--plot", tmp_path / "no" / "p.png"], "No such file or directory"),
+        (["eval", truth, truth, "--plot", "p.jpg"], "--plot: expected a name that ends in .png, got p.jpg"),
+        (["eval", tmp_path / "broken", truth], "broken/results.json: expected the results of a run"),
     ):  # fmt: skip
         line = complaint(*args)
         assert line.startswith("jaxpose") and re.search(message, line, re.IGNORECASE), line

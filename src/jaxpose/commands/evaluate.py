@@ -51,6 +51,8 @@ class Config:
     def __post_init__(self):
         if not 0 <= self.max_difference < math.inf:
             raise ValueError(f"--max-difference: expected 0 or more, got {self.max_difference}")
+        if self.plot is not None and self.plot.suffix != ".png":
+            raise ValueError(f"--plot: expected a name that ends in .png, got {self.plot}")
         if not math.isfinite(self.time_offset):
             raise ValueError(f"--time-offset: expected a finite number, got {self.time_offset}")
         for option in ("rpe_frames", "rpe_seconds", "rpe_metres"):
@@ -223,7 +225,7 @@ def _relative(config: Config, pairs: _Pairs) -> tuple[tuple[Relative, ...], tupl
         try:
             rpe = metrics.rpe(pairs.estimate, pairs.reference, delta, config.align, along=along.get(unit))
         except DataError:
-            notes.append(f"RPE over {_distance(delta, unit)}: no two poses are so far apart")
+            notes.append(f"RPE over {_distance(delta, unit)}: no two poses are that far apart, to a tenth")
         else:
             found.append(Relative(float(delta), unit, rpe.translation_m, rpe.rotation_deg, rpe.pairs))
     return tuple(found), tuple(notes)

@@ -43,9 +43,7 @@ def read_source(path: Path) -> Source:
         inner = sorted(folder.parent.name for folder in path.glob("*/trajectory.txt"))
         hint = f"runs in it: {', '.join(inner)}" if inner else "none"
         raise DataError(f"{path}: expected a run folder with trajectory.txt, got {hint}")
-    results = path / "results.json"
-    name = json.loads(results.read_text()).get("experiment", "") if results.is_file() else ""
-    return Source(path, f"{name} run".strip(), io.read_tum(file), True, True)
+    return Source(path, f"{_experiment(path / 'results.json')} run".strip(), io.read_tum(file), True, True)
 
 
 def read_field(source: Source) -> Callable[[Float[np.ndarray, " n"]], Float[np.ndarray, "n 4 4"]]:
@@ -63,3 +61,13 @@ def read_field(source: Source) -> Callable[[Float[np.ndarray, " n"]], Float[np.n
     except (ValueError, EOFError, zipfile.BadZipFile) as error:
         found = " ".join(str(error).split()).removeprefix(f"{file}: ")
         raise DataError(f"{file}: {found} (what older runs left needs a new run)") from None
+
+
+def _experiment(results: Path) -> str:
+    """Which experiment a run is of, where it says so: a run that goes on has no results yet."""
+    if not results.is_file():
+        return ""
+    try:
+        return json.loads(results.read_text())["experiment"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise DataError(f"{results}: expected the results of a run, got {type(error).__name__}") from None
