@@ -9,15 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxpose.camera import Camera
-from jaxpose.data.photographs import (
-    OPENGL,
-    SUFFIXES,
-    check_poses,
-    frame_numbers,
-    image_size,
-    natural_order,
-    read_images,
-)
+from jaxpose.data.images import SUFFIXES, image_size, natural_order
+from jaxpose.data.photographs import OPENGL, check_poses, frame_numbers, read_images
 from jaxpose.errors import DataError
 from jaxpose.recording import Photographs, take
 

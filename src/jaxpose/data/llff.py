@@ -6,7 +6,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxpose.camera import Camera
-from jaxpose.data.photographs import OPENGL, SUFFIXES, check_poses, frame_numbers, image_size, read_images
+from jaxpose.data.images import SUFFIXES, image_size
+from jaxpose.data.photographs import OPENGL, check_poses, frame_numbers, read_images
 from jaxpose.errors import DataError
 from jaxpose.metrics import nearest_rotation
 from jaxpose.recording import Photographs, take

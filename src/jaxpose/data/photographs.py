@@ -3,7 +3,6 @@
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -11,17 +10,12 @@ from PIL import Image
 
 from jaxpose import camera
 from jaxpose.camera import Camera
+from jaxpose.data.images import image_size, open_image
 from jaxpose.errors import DataError
 from jaxpose.metrics import nearest_rotation
 
-SUFFIXES = (".png", ".jpg", ".jpeg")
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # right, up, back to right, down, forward, and the other way
 _MOST_OFF_ROTATION = 1e-2  # entries of a rotation matrix; more is not rounding
-
-
-def image_size(file: Path) -> tuple[int, int]:
-    """Width and height, from the image's header; DataError for what is no image."""
-    return _image(file, lambda image: image.size)
 
 
 def read_images(
@@ -44,16 +38,11 @@ def read_images(
     rgb = np.empty((len(files), small.height, small.width, 3), np.uint8)
     transparent = False
     for number, file in enumerate(files):
-        opaque, alpha = _image(file, _on_white)
+        opaque, alpha = open_image(file, _on_white)
         transparent |= alpha
         # The box filter is the mean over each new pixel's area.
         rgb[number] = opaque.resize((small.width, small.height), Image.Resampling.BOX)
     return rgb, transparent, small
-
-
-def natural_order(name: str) -> list[str | int]:
-    """Sort key by which r_2 comes before r_10."""
-    return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
 
 
 def frame_numbers(names: Sequence[str]) -> tuple[Float[np.ndarray, " n"], str]:
@@ -99,13 +88,3 @@ def _on_white(image: Image.Image) -> tuple[Image.Image, bool]:
     white = Image.new("RGBA", image.size, "white")
     transparent = bool(np.asarray(image.getchannel("A")).min() < 255)
     return Image.alpha_composite(white, image).convert("RGB"), transparent
-
-
-def _image(file: Path, use: Callable[[Image.Image], Any]) -> Any:
-    """What `use` makes of an image file, of which Pillow reads only the header until pixels are asked for."""
-    try:
-        with Image.open(file) as image:
-            return use(image)
-    except Exception as error:  # Pillow raises many kinds on damaged files
-        found = " ".join(str(error).split()) or type(error).__name__
-        raise DataError(f"{file}: expected an image, got {found}") from None

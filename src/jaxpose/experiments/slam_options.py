@@ -9,7 +9,7 @@ import jax
 import numpy as np
 import tyro
 
-from jaxpose.data import sevenscenes
+from jaxpose.data import recordings
 from jaxpose.data.synthetic import RoomConfig, room
 from jaxpose.errors import DataError
 from jaxpose.imu import ADIS16448, QUIET, Imu, ImuNoise
@@ -27,8 +27,8 @@ class Options:
     """Settings of a run; a recording and these are all that a result depends on."""
 
     data: Path | None = None  # folder of a recording; without one a synthetic room is made on the fly
-    format: Literal["sevenscenes", "room"] | None = None  # None: sevenscenes with --data, room without
-    recorded_hz: float = 30.0  # frame rate of a sevenscenes recording, which has no time stamps
+    format: recordings.Format | Literal["room"] | None = None  # None: found by the files of --data
+    recorded_hz: float = 30.0  # frame rate of a recording whose layout has no time stamps
     rate_hz: float | None = None  # frames are thinned to this; None: the room's, or all frames
     start: int = 0  # first frame used, counted before thinning
     frames: int | None = None  # how many frames from there, counted before thinning; None: all
@@ -52,8 +52,8 @@ class Options:
             raise ValueError(f"--frames: expected at least {FEWEST_FRAMES}, got {self.frames}")
         if self.slam.voxel is not None and not 0 < self.slam.voxel < math.inf:
             raise ValueError(f"--voxel: expected a positive number, got {self.slam.voxel}")
-        if self.format == "sevenscenes" and self.data is None:
-            raise ValueError("--format sevenscenes: expected --data DIR with it")
+        if self.format not in ("room", None) and self.data is None:
+            raise ValueError(f"--format {self.format}: expected --data DIR with it")
         if self.format == "room" and self.data is not None:
             raise ValueError(f"--format room: expected no --data, as the room is made; got {self.data}")
         _room_config(self)
@@ -77,17 +77,21 @@ class Source(NamedTuple):
 def load(options: Options) -> Source:
     """The recording that the options name: loaded or made, given an IMU if one is needed, cut and thinned.
 
-    An IMU is simulated from the truth before frames are thinned. Time starts at the first frame used. Raises
-    DataError or OSError for what cannot be used.
+    An IMU is simulated from the truth before frames are thinned, unless the recording has its own. Time
+    starts at the first frame used. Raises DataError or OSError for what cannot be used.
     """
+    name = "room"
     if options.data is None:
         recording = room(_room_config(options))
         noise = options.room.imu_noise
         imu = f"{options.room.imu_rate_hz:g} Hz, exact derivatives of the room's path, {_sheet(noise)}"
     else:
-        recording = sevenscenes.load(options.data, rate_hz=options.recorded_hz)
+        name = recordings.find_format(options.data) if options.format in ("room", None) else options.format
+        recording = recordings.load(options.data, name, rate_hz=options.recorded_hz)
         imu = "none"
-        if options.compare or options.slam.imu != "none":
+        if recording.imu is not None:
+            imu = f"{1 / float(np.median(np.diff(recording.imu.t))):.3g} Hz, the recording's own, as read"
+        elif options.compare or options.slam.imu != "none":
             recording = recording._replace(imu=_simulated(recording, options))
             imu = (
                 f"simulated at {SIMULATED_HZ:g} Hz from the truth before thinning (cubic spline positions, "
@@ -98,7 +102,7 @@ def load(options: Options) -> Source:
     recording = _cut(recording, options)
     about = {
         "name": recording.name,
-        "format": "room" if options.data is None else "sevenscenes",
+        "format": name,
         "path": options.data,
         "frames_recorded": recorded,
         "start": options.start,
