@@ -2,11 +2,15 @@
 
 import os
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import matplotlib
+import numpy as np
 import pytest
+from PIL import Image
+from scipy.spatial.transform import Rotation
 
 matplotlib.use("Agg")
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -31,3 +35,40 @@ def data_dir() -> Path:
     if not folder:
         pytest.skip("needs real recordings: JAXPOSE_DATA is not set")
     return Path(folder)
+
+
+class Walk(NamedTuple):
+    """A few frames of noise with known poses, for loaders to read back: 32 x 24 pixels."""
+
+    rgb: np.ndarray  # (n, 24, 32, 3) uint8
+    counts: np.ndarray  # (n, 24, 32) uint16, the first pixels 0 and 65535
+    T_world_cam: np.ndarray  # (n, 4, 4)
+
+
+@pytest.fixture(scope="session")
+def walk() -> Walk:
+    generator = np.random.default_rng(7)
+    rgb = generator.integers(0, 256, (6, 24, 32, 3), np.uint8)
+    counts = generator.integers(400, 30000, (6, 24, 32)).astype(np.uint16)
+    counts[:, 0, :2] = [0, 65535]
+    poses = np.tile(np.eye(4), (6, 1, 1))
+    poses[:, :3, :3] = Rotation.from_rotvec(generator.normal(size=(6, 3))).as_matrix()
+    poses[:, :3, 3] = generator.normal(size=(6, 3))
+    return Walk(rgb, counts, poses)
+
+
+@pytest.fixture(scope="session")
+def save():
+    """Write an image, its folders with it."""
+
+    def write(file: Path, pixels: np.ndarray) -> None:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(pixels).save(file)
+
+    return write
+
+
+@pytest.fixture(scope="session")
+def metres():
+    """Depth [m] that counts mean."""
+    return lambda counts, per_metre: np.where(counts == 65535, 0, counts) / per_metre

@@ -30,7 +30,7 @@ def depth_from_cloud(
     corners = jnp.asarray(
         [[u, v] for u in (0, camera.width - 1) for v in (0, camera.height - 1)], jnp.float32
     )
-    widest = _BEYOND * float(jnp.abs(pixel_direction(camera, corners)[:, :2]).max()) * 2**0.5
+    widest = _BEYOND * float(jnp.linalg.norm(pixel_direction(camera, corners)[:, :2], axis=1).max())
     points = jnp.asarray(points_world, jnp.float32)
 
     @jax.jit

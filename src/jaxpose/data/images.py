@@ -188,7 +188,7 @@ def usable_poses(
         poses[i, :3, :3] = rotation
     notes = []
     if not finite.all():
-        lacking = [names[i] for i in np.flatnonzero(~finite)]
+        lacking = [name for name, there in zip(names, finite, strict=True) if not there]
         notes.append(f"{len(lacking)} frames without a usable pose ({lack}): {some(lacking)}")
     if repaired:
         notes.append(

@@ -1,0 +1,185 @@
+"""The TUM RGB-D loader on made folders of the exact layout, and on damaged ones."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from jaxpose.data import tum
+from jaxpose.errors import DataError
+
+START = 1305031102.0  # seconds since 1970
+COLOR_T = START + np.array([0.0, 0.0332, 0.0681, 0.1003, 0.1340, 0.1675])
+DEPTH_T = COLOR_T + [0.0051, -0.0043, 0.0215, 0.0062, -0.0070, 0.0012]  # the third is too far from its colour
+LAYOUT = "rgbd_dataset_freiburg1_desk"
+
+
+def write_list(file, stamps, kind):
+    lines = [f"# {kind} images", "# file: 'desk.bag'", "# timestamp filename"]
+    file.write_text("\n".join(lines + [f"{t:.6f} {kind}/{t:.6f}.png" for t in stamps]) + "\n")
+
+
+def write_truth(file, t, T):
+    rows = [
+        [stamp, *pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat()]
+        for stamp, pose in zip(t, T, strict=True)
+    ]
+    file.write_text("# ground truth\n" + "".join(" ".join(f"{x:.12f}" for x in row) + "\n" for row in rows))
+
+
+@pytest.fixture
+def desk(tmp_path, walk, save):
+    """Six frames; true poses 4 ms after each colour image, and far ones between, but none for the fifth."""
+    folder = tmp_path / LAYOUT
+    for i in range(6):
+        save(folder / f"rgb/{COLOR_T[i]:.6f}.png", walk.rgb[i])
+        save(folder / f"depth/{DEPTH_T[i]:.6f}.png", walk.counts[i])
+    write_list(folder / "rgb.txt", COLOR_T, "rgb")
+    write_list(folder / "depth.txt", DEPTH_T, "depth")
+    kept = [0, 1, 2, 3, 5]
+    t = np.stack([COLOR_T[kept] - 0.012, COLOR_T[kept] + 0.004], axis=1).ravel()
+    T = np.stack([np.tile(np.eye(4), (5, 1, 1)), walk.T_world_cam[kept]], axis=1).reshape(-1, 4, 4)
+    write_truth(folder / "groundtruth.txt", t[t != COLOR_T[5] - 0.012], T[t != COLOR_T[5] - 0.012])
+    (folder / "accelerometer.txt").write_text("# timestamp ax ay az\n1305031098.6 0.1 8.1 -4.0\n")
+    return folder
+
+
+def test_a_made_sequence_reads_back(desk, walk, metres):
+    recording = tum.load(desk)
+    used = [0, 1, 3, 4, 5]
+    assert recording.name.endswith(f"/{LAYOUT}")
+    assert recording.camera == (
+        *(517.3, 516.5, 318.6, 255.3, 32, 24),
+        (0.2624, -0.9531, -0.0054, 0.0026, 1.1633),
+    )
+    np.testing.assert_allclose(recording.t, COLOR_T[used] - START, atol=1e-6)
+    for row, i in enumerate(used):
+        rgb, depth = recording.read(row)
+        np.testing.assert_array_equal(rgb, walk.rgb[i])
+        np.testing.assert_allclose(depth, metres(walk.counts[i], 5000), rtol=1e-6)
+        assert depth.dtype == np.float32
+    assert np.isnan(recording.T_world_cam[3]).all()
+    np.testing.assert_allclose(recording.T_world_cam[[0, 1, 2, 4]], walk.T_world_cam[[0, 1, 3, 5]], atol=1e-9)
+    assert recording.imu is None
+    color, depth, intrinsics, truth, accelerometer = recording.notes
+    assert color == (
+        "1 of 6 colour images left out, no depth of their own within 0.02 s: 1305031102.068100.png"
+    )
+    assert depth.startswith("1 of 6 depth images left out") and "1305031102.089600.png" in depth
+    assert intrinsics.endswith("which are for 640x480; the images are 32x24")
+    assert truth == "1 frames without a usable pose (none within 0.02 s): 1305031102.134000"
+    assert "accelerometer.txt" in accelerometer
+
+
+def test_the_limit_of_association_is_a_setting(desk):
+    assert len(tum.load(desk, max_difference_s=0.04).t) == 6
+    assert len(tum.load(desk, max_difference_s=0.005).t) == 2
+    with pytest.raises(
+        DataError, match=f"{LAYOUT}: expected colour and depth within 0.001 s, got stamps from"
+    ):
+        tum.load(desk, max_difference_s=0.001)
+
+
+def test_an_image_has_one_partner_the_nearest(tmp_path, walk, save):
+    """As the data set's associate.py: pairs by increasing difference, each image once."""
+    generator = np.random.default_rng(3)
+    color_t = START + np.cumsum(generator.uniform(0.005, 0.03, 40))
+    depth_t = START + np.cumsum(generator.uniform(0.005, 0.03, 40))
+    for kind, stamps, pixels in (("rgb", color_t, walk.rgb[0]), ("depth", depth_t, walk.counts[0])):
+        for t in stamps:
+            save(tmp_path / f"{kind}/{t:.6f}.png", pixels)
+        write_list(tmp_path / f"{kind}.txt", stamps, kind)
+    left, right, expected = set(range(40)), set(range(40)), []
+    differences = np.abs(np.round(color_t, 6)[:, None] - np.round(depth_t, 6)[None])
+    for flat in np.argsort(differences, axis=None):
+        i, j = divmod(int(flat), 40)
+        if differences[i, j] < 0.02 and i in left and j in right:
+            left.remove(i)
+            right.remove(j)
+            expected.append(i)
+    expected.sort()
+    assert 20 < len(expected) < 40
+    t = tum.load(tmp_path).t
+    np.testing.assert_allclose(t, color_t[expected] - color_t[expected[0]], atol=2e-6)
+
+
+@pytest.mark.parametrize(
+    "name, fx, lens",
+    [
+        ("rgbd_dataset_freiburg2_xyz", 520.9, 5),
+        ("FR3_office", 535.4, 0),
+        ("fr1", 517.3, 5),
+        ("fr10", 525.0, 0),
+        ("kitchen", 525.0, 0),
+    ],
+)
+def test_the_camera_is_known_by_the_name(desk, name, fx, lens):
+    recording = tum.load(desk.rename(desk.parent / name))
+    assert recording.camera.fx == fx and len(recording.camera.distortion) == lens
+    assumed = [note for note in recording.notes if "no freiburg1, 2 or 3 in the folder's name" in note]
+    assert len(assumed) == (fx == 525.0)
+
+
+def test_intrinsics_of_a_file_come_first(desk):
+    (desk.parent / "camera-intrinsics.txt").write_text("30 0 15.5\n0 31 11.5\n0 0 1\n")
+    recording = tum.load(desk)
+    assert recording.camera == (30, 31, 15.5, 11.5, 32, 24, ())
+    assert not any("published" in note for note in recording.notes)
+
+
+def test_without_truth(desk):
+    (desk / "groundtruth.txt").unlink()
+    recording = tum.load(desk, depth_per_metre=1000.0)
+    assert recording.T_world_cam is None
+    assert "no groundtruth.txt: there is no truth to compare with" in recording.notes
+    assert recording.read(0).depth.max() > 25
+
+
+FIRST = "rgb/1305031102.000000.png"
+
+
+@pytest.mark.parametrize(
+    "file, content, message",
+    [
+        ("rgb.txt", None, "rgb.txt: expected lines of a stamp and a file name, got nothing"),
+        ("depth.txt", "# nothing\n", "depth.txt: expected lines of a stamp and a file name, got none"),
+        ("rgb.txt", "# a\n1.5\n", "rgb.txt:2: expected a stamp in seconds and a file name, got '1.5'"),
+        ("rgb.txt", "one rgb/1.png\n", "rgb.txt:1: expected a stamp in seconds"),
+        ("rgb.txt", "nan rgb/1.png\n", "rgb.txt:1: expected a stamp in seconds"),
+        ("rgb.txt", "2 a.png\n2 b.png\n", "rgb.txt:2: expected a stamp after 2.0 s, got 2.0 s"),
+        (FIRST, None, f"{FIRST}: expected an image, got nothing"),
+        (FIRST, "text", f"{FIRST}: expected an image, got cannot identify"),
+        ("groundtruth.txt", "1 2 3\n", "groundtruth.txt:1: expected 8 numbers .*, got 3"),
+        ("groundtruth.txt", "1 0 0 0 0 0 0 x\n", "groundtruth.txt:1: expected 8 numbers"),
+        ("camera-intrinsics.txt", "1 2 3\n", "intrinsics.txt: expected 3 rows of 3 numbers, got 1 rows"),
+    ],
+)
+def test_unusable_files_are_named(desk, file, content, message):
+    (desk / file).unlink() if content is None else (desk / file).write_text(content)
+    with pytest.raises(DataError, match=message) as error:
+        tum.load(desk)
+    assert str(desk) in str(error.value) and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "pixels, message",
+    [
+        (np.full((24, 32), 7, np.uint8), "expected depth in 1/5000 m, one channel of 16 bits, got uint8"),
+        (np.full((24, 30), 7, np.uint16), "expected 32x24, the size of 1305031102.000000.png, got 30x24"),
+    ],
+)
+def test_depth_of_the_wrong_kind(desk, save, pixels, message):
+    file = f"depth/{DEPTH_T[0]:.6f}.png"
+    save(desk / file, pixels)
+    with pytest.raises(DataError, match=f"{file}: {message}"):
+        tum.load(desk)
+
+
+def test_wrong_folders_and_settings(desk, tmp_path):
+    with pytest.raises(DataError, match="nowhere: expected a folder with rgb.txt and depth.txt, got nothing"):
+        tum.load(tmp_path / "nowhere")
+    with pytest.raises(DataError, match="rgb.txt: expected lines"):
+        tum.load(tmp_path)
+    with pytest.raises(ValueError, match="max_difference_s: expected a positive number"):
+        tum.load(desk, max_difference_s=0.0)
+    with pytest.raises(ValueError, match="depth_per_metre: expected a positive number"):
+        tum.load(desk, depth_per_metre=-1.0)
