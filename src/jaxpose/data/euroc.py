@@ -22,12 +22,14 @@ from jaxpose.data.images import check_depth, common_size, found, read_color, rea
 from jaxpose.errors import DataError
 from jaxpose.imu import Imu, ImuNoise
 from jaxpose.imu_simulation import interpolant
+from jaxpose.io import nearest
 from jaxpose.io_ply import read_points
 from jaxpose.recording import Frame, Recording
 
 _IMU_COLUMNS = "7 columns (stamp, 3 rates, 3 accelerations)"
 _TRUTH_COLUMNS = "17 columns (stamp, 3 position, 4 quaternion, 3 velocity, 3 gyro bias, 3 accelerometer bias)"
 _MOST_GAP_S = 0.1  # between two true poses that one is interpolated from
+_AT_A_STAMP_S = 1e-3  # so close to a true pose, no other needs to be near
 
 
 class ImuLog(NamedTuple):
@@ -158,7 +160,8 @@ def _truth_at(mav0: Path, t: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarray,
     after = np.clip(np.searchsorted(truth.t, t), 1, max(len(truth.t) - 1, 1))
     if len(truth.t) > 1:
         gap = truth.t[after] - truth.t[after - 1]
-        inside = (t >= truth.t[0]) & (t <= truth.t[-1]) & (gap <= _MOST_GAP_S)
+        known = (gap <= _MOST_GAP_S) | (np.abs(truth.t[nearest(t, truth.t)] - t) <= _AT_A_STAMP_S)
+        inside = (t >= truth.t[0]) & (t <= truth.t[-1]) & known
         poses[inside] = interpolant(truth.t, truth.T_world_body).pose(t[inside])
     return poses, ()
 

@@ -188,7 +188,7 @@ def usable_poses(
         poses[i, :3, :3] = rotation
     notes = []
     if not finite.all():
-        lacking = [name for name, there in zip(names, finite, strict=True) if not there]
+        lacking = [names[int(i)] for i in np.flatnonzero(~finite)]
         notes.append(f"{len(lacking)} frames without a usable pose ({lack}): {some(lacking)}")
     if repaired:
         notes.append(

@@ -1,8 +1,8 @@
 """RGB-D-inertial SLAM: a camera tracked by a continuous pose field, frames and IMU on the same trajectory.
 
 Without options it walks through a synthetic room, at 5 Hz with a 200 Hz IMU, and writes a run folder under
-outputs/imu_slam. `--data DIR` tracks a 7-Scenes recording instead, with an IMU simulated from its true poses.
-`--compare` puts all IMU modes side by side.
+outputs/imu_slam. `--data DIR` tracks a recording instead, in a layout found by its files, with its own IMU
+(EuRoC) or one simulated from its true poses. `--compare` puts all IMU modes side by side.
 """
 
 from collections.abc import Sequence

@@ -80,7 +80,7 @@ def load(options: Options) -> Source:
     An IMU is simulated from the truth before frames are thinned, unless the recording has its own. Time
     starts at the first frame used. Raises DataError or OSError for what cannot be used.
     """
-    name = "room"
+    name, own_imu = "room", False
     if options.data is None:
         recording = room(_room_config(options))
         noise = options.room.imu_noise
@@ -88,7 +88,7 @@ def load(options: Options) -> Source:
     else:
         name = recordings.find_format(options.data) if options.format in ("room", None) else options.format
         recording = recordings.load(options.data, name, rate_hz=options.recorded_hz)
-        imu = "none"
+        imu, own_imu = "none", recording.imu is not None
         if recording.imu is not None:
             imu = f"{1 / float(np.median(np.diff(recording.imu.t))):.3g} Hz, the recording's own, as read"
         elif options.compare or options.slam.imu != "none":
@@ -100,6 +100,8 @@ def load(options: Options) -> Source:
             )
     recorded = len(recording.t)
     recording = _cut(recording, options)
+    if own_imu:
+        _check_gravity(recording, options)
     about = {
         "name": recording.name,
         "format": name,
@@ -146,6 +148,17 @@ def _simulated(recording: Recording, options: Options) -> Imu:
         key=jax.random.fold_in(jax.random.key(options.slam.seed), 200),
         gravity_world=recording.gravity_world,
     )
+
+
+def _check_gravity(recording: Recording, options: Options) -> None:
+    """Refuse real readings where nothing says which way is down: the first frame used has no true pose."""
+    truth = recording.T_world_cam
+    if (options.compare or options.slam.imu != "none") and (truth is None or not np.isfinite(truth[0]).all()):
+        mode = "--compare" if options.compare else f"--imu {options.slam.imu}"
+        raise DataError(
+            f"{recording.name}: {mode} expected a true pose of frame {options.start}, which says where "
+            "gravity points, got none; --imu none goes without"
+        )
 
 
 def _cut(recording: Recording, options: Options) -> Recording:
