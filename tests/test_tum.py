@@ -1,5 +1,7 @@
 """The TUM RGB-D loader on made folders of the exact layout, and on damaged ones."""
 
+import shutil
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -132,6 +134,39 @@ def test_without_truth(desk):
     assert recording.T_world_cam is None
     assert "no groundtruth.txt: there is no truth to compare with" in recording.notes
     assert recording.read(0).depth.max() > 25
+
+
+def test_the_first_of_lines_with_one_stamp_counts(desk, walk):
+    """As in the published truth of fr2_desk."""
+    file = desk / "groundtruth.txt"
+    lines = file.read_text().splitlines()
+    last = lines[-1].split()
+    file.write_text("\n".join([*lines, " ".join([last[0], "9", "9", "9", *last[4:]])]))
+    recording = tum.load(desk)
+    np.testing.assert_allclose(recording.T_world_cam[4], walk.T_world_cam[5], atol=1e-9)
+    assert "1 lines of groundtruth.txt repeat the stamp before them and are ignored" in recording.notes
+    file.write_text("\n".join([*lines, "1 0 0 0 0 0 0 1"]))
+    with pytest.raises(DataError, match=f"groundtruth.txt:{len(lines) + 1}: expected a stamp after"):
+        tum.load(desk)
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(
+    "name, repeated", [("fr2_desk_groundtruth.txt", 1), ("freiburg1_xyz-groundtruth.txt", 0)]
+)
+def test_real_truth(desk, walk, save, data_dir, name, repeated):
+    """The published files, with images made at the stamps of some of their poses."""
+    shutil.copy(data_dir / "trajectories" / name, desk / "groundtruth.txt")
+    truth = np.loadtxt(desk / "groundtruth.txt")[10::400]
+    for kind, pixels in (("rgb", walk.rgb[0]), ("depth", walk.counts[0])):
+        for t in truth[:, 0]:
+            save(desk / f"{kind}/{t:.6f}.png", pixels)
+        write_list(desk / f"{kind}.txt", truth[:, 0], kind)
+    recording = tum.load(desk)
+    assert any("repeat the stamp" in note for note in recording.notes) == bool(repeated)
+    np.testing.assert_allclose(recording.T_world_cam[:, :3, 3], truth[:, 1:4], atol=1e-12)
+    R = Rotation.from_quat(truth[:, 4:]).as_matrix()
+    np.testing.assert_allclose(recording.T_world_cam[:, :3, :3], R, atol=1e-9)
 
 
 FIRST = "rgb/1305031102.000000.png"

@@ -105,7 +105,7 @@ def read_camera_sheet(file: Path) -> tuple[Camera, Float[np.ndarray, "4 4"]]:
     row = lambda key, count: _numbers(file, text, rf"^{key}[ \t]*:[^\[\n]*\[([^\]]*)\]", key, count)
     lens, size = row("distortion_coefficients", 4), row("resolution", 2)
     fx, fy, cx, cy = row("intrinsics", 4)
-    camera = Camera(fx, fy, cx, cy, int(size[0]), int(size[1]), tuple(lens))
+    camera = Camera(fx, fy, cx, cy, int(size[0]), int(size[1]), tuple(lens) if any(lens) else ())
     return camera, _read_extrinsics(file, text)
 
 

@@ -25,7 +25,8 @@ from jaxpose.data.images import (
     usable_poses,
 )
 from jaxpose.errors import DataError
-from jaxpose.io import nearest, read_tum
+from jaxpose.io import nearest
+from jaxpose.io_trajectory import read_trajectory
 from jaxpose.recording import Frame, Recording
 
 _SIZE = (640, 480)
@@ -55,10 +56,11 @@ def load(path: Path | str, *, max_difference_s: float = 0.02, depth_per_metre: f
 
     Colour and depth are paired one to one, nearest first, if their stamps are less than `max_difference_s`
     apart (0.02 s is the data set's own tools'); frames have the stamps of colour. The true pose is the one
-    nearest in time, NaN where none is that close; without `groundtruth.txt` there is no truth. Intrinsics
-    (3x3) are read from `camera-intrinsics.txt` in or beside the folder; else they and the lens are the
-    published ones of freiburg1, 2 or 3, by the folder's name. Depth is registered to colour and stored as
-    `depth_per_metre` counts. `accelerometer.txt` is not used. `notes` tells what was left out or assumed.
+    nearest in time, NaN where none is that close; without `groundtruth.txt` there is no truth, and of lines
+    with one stamp (the published fr2_desk has two) the first counts. Intrinsics (3x3) are read from
+    `camera-intrinsics.txt` in or beside the folder; else they and the lens are the published ones of
+    freiburg1, 2 or 3, by the folder's name. Depth is registered to colour and stored as `depth_per_metre`
+    counts. `accelerometer.txt` is not used. `notes` tells what was left out or assumed.
 
     DataError naming the file for anything that cannot be used; ValueError for a setting that is not positive.
     """
@@ -169,8 +171,14 @@ def _truth(
     """The true poses nearest in time, and a note on frames without."""
     if not file.is_file():
         return None, ("no groundtruth.txt: there is no truth to compare with",)
-    truth = read_tum(file)
+    truth, form, _, repeated = read_trajectory(file)
+    if form != "TUM":
+        raise DataError(f"{file}: expected lines of t tx ty tz qx qy qz qw, got a {form} file")
     row = nearest(stamps, truth.t)
     near = np.abs(truth.t[row] - stamps) < limit
     poses = np.where(near[:, None, None], truth.T[row], np.nan)
-    return usable_poses(poses, [f"{t:.6f}" for t in stamps], lambda i: str(file), f"none within {limit:g} s")
+    names = [f"{t:.6f}" for t in stamps]
+    checked, notes = usable_poses(poses, names, lambda i: str(file), f"none within {limit:g} s")
+    if repeated:
+        notes += (f"{repeated} lines of groundtruth.txt repeat the stamp before them and are ignored",)
+    return checked, notes
