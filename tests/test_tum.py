@@ -183,7 +183,7 @@ FIRST = "rgb/1305031102.000000.png"
         ("rgb.txt", "2 a.png\n2 b.png\n", "rgb.txt:2: expected a stamp after 2.0 s, got 2.0 s"),
         (FIRST, None, f"{FIRST}: expected an image, got nothing"),
         (FIRST, "text", f"{FIRST}: expected an image, got cannot identify"),
-        ("groundtruth.txt", "1 2 3\n", "groundtruth.txt:1: expected 8 numbers .*, got 3"),
+        ("groundtruth.txt", "1 2 3\n", "groundtruth.txt:1: expected a trajectory, TUM .*got '1 2 3'"),
         ("groundtruth.txt", "1 0 0 0 0 0 0 x\n", "groundtruth.txt:1: expected 8 numbers"),
         ("camera-intrinsics.txt", "1 2 3\n", "intrinsics.txt: expected 3 rows of 3 numbers, got 1 rows"),
     ],

@@ -176,7 +176,7 @@ def _with_images(config: Config, source: Source, trajectory: io.Trajectory) -> t
 
 def _on_disk(folder: Path, images: tuple[str, ...]) -> list[Path]:
     """The files of the images, whose names may lack a suffix; nothing unless all are there."""
-    from jaxpose.data.photographs import SUFFIXES
+    from jaxpose.data.images import SUFFIXES
 
     candidates = [[folder / name, *(folder / f"{name}{suffix}" for suffix in SUFFIXES)] for name in images]
     found = [next((file for file in files if file.is_file()), None) for files in candidates]
@@ -186,7 +186,7 @@ def _on_disk(folder: Path, images: tuple[str, ...]) -> list[Path]:
 def _as_on_disk(camera: "Camera", file: Path) -> tuple["Camera", tuple[str, ...]]:
     """The camera of the images as they are in their files, which a run may have made smaller."""
     from jaxpose.camera import resized
-    from jaxpose.data.photographs import image_size
+    from jaxpose.data.images import image_size
 
     width, height = image_size(file)
     if (width, height) == (camera.width, camera.height):

@@ -12,19 +12,15 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 import tyro
+from jaxtyping import Float
 
 from jaxpose.command import markdown_table
-from jaxpose.commands import fit_fields
-from jaxpose.commands.fit_fields import Fitted
 from jaxpose.commands.source import read_source
-from jaxpose.data import euroc
 from jaxpose.errors import DataError
-from jaxpose.imu import Imu
 from jaxpose.io import Trajectory
-from jaxpose.io_field import write_field
-from jaxpose.metrics import Similarity
+from jaxpose.metrics import Similarity, Statistics
 
-_FEWEST = 20  # poses, inertial readings
+FEWEST = 20  # poses, inertial readings
 _SLOW = 3.0  # times the best field's error
 
 
@@ -65,6 +61,28 @@ class Config:
                     raise ValueError(f"--{option.replace('_', '-')}: expected positive numbers, got {value}")
 
 
+class Inertial(NamedTuple):
+    """How far a field's derivatives are from readings, after constant biases and gravity are fitted."""
+
+    omega_rms: float  # rad/s, per axis
+    acceleration_rms: float  # m/s^2, per axis
+    gyro_bias: Float[np.ndarray, "3"]
+    gravity_world: Float[np.ndarray, "3"]  # m/s^2, in the trajectory's world
+    samples: int
+
+
+class Fitted(NamedTuple):
+    """A field and what is left of the poses that it has not seen."""
+
+    name: str
+    highest_hz: float
+    parameters: int
+    seconds: float
+    translation_m: Statistics
+    rotation_deg: Statistics
+    inertial: Inertial | None
+
+
 class Sensor(NamedTuple):
     """What an IMU's readings are worth, one sigma a reading: by its data sheet, and by themselves."""
 
@@ -95,8 +113,13 @@ def run(config: Config, on_field: Callable[[str], None] | None = None) -> Result
 
     Raises DataError or OSError for what cannot be used.
     """
+    from jaxpose.commands import fit_fields  # here, as it loads jax, which --help does without
+    from jaxpose.io_field import write_field
+
     source, trajectory = _trajectory(config)
-    imu, sensor, notes = (None, None, ()) if config.imu is None else _imu(config.imu, trajectory)
+    imu, sensor, notes = (None, None, ())
+    if config.imu is not None:
+        imu, sensor, notes = fit_fields.readings(config.imu, trajectory)
     span_s = float(trajectory.t[-1] - trajectory.t[0])
     rate_hz = 1 / float(np.median(np.diff(trajectory.t)))
     held = np.arange(len(trajectory.t)) % 10 == 5
@@ -214,27 +237,6 @@ def _trajectory(config: Config) -> tuple[str, Trajectory]:
         trajectory = trajectory._replace(t=trajectory.t / config.rate_hz)
     elif config.rate_hz is not None:
         raise DataError(f"{source.path}: expected no --rate-hz, as a {source.what} has stamps")
-    if len(trajectory.t) < _FEWEST:
-        raise DataError(f"{source.path}: expected at least {_FEWEST} poses to fit, got {len(trajectory.t)}")
+    if len(trajectory.t) < FEWEST:
+        raise DataError(f"{source.path}: expected at least {FEWEST} poses to fit, got {len(trajectory.t)}")
     return str(source), trajectory
-
-
-def _imu(folder: Path, trajectory: Trajectory) -> tuple[Imu, Sensor, tuple[str, ...]]:
-    """The readings within the trajectory's span, on its clock."""
-    log = euroc.load_imu(folder)
-    t = log.t0_ns * 1e-9 + np.asarray(log.imu.t, np.float64)
-    first, last = trajectory.t[[0, -1]]
-    within = (t >= first) & (t <= last)
-    if within.sum() < _FEWEST:
-        raise DataError(
-            f"{folder}: expected an IMU on the clock of the poses, {first:.3f} to {last:.3f} s, got "
-            f"{t[0]:.3f} to {t[-1]:.3f} s"
-        )
-    omega, force = (np.asarray(x)[within] for x in (log.imu.omega_body, log.imu.acceleration_body))
-    rate_hz = 1 / float(np.median(np.diff(np.asarray(log.imu.t))))
-    measured = (fit_fields.sample_noise(omega), fit_fields.sample_noise(force))
-    sensor = Sensor(int(within.sum()), rate_hz, fit_fields.floor(log.noise, rate_hz), measured)
-    notes = ()
-    if not within.all():
-        notes = (f"{int((~within).sum())} of {len(t)} inertial readings lie outside of the poses: not used",)
-    return Imu(t[within], omega, force), sensor, notes

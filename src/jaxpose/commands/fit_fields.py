@@ -4,6 +4,7 @@ import math
 import time
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -14,11 +15,13 @@ from scipy.ndimage import median_filter
 from scipy.spatial.transform import Rotation
 
 from jaxpose import fields, metrics
+from jaxpose.commands.fit import FEWEST, Fitted, Inertial, Sensor
+from jaxpose.data import euroc
+from jaxpose.errors import DataError
 from jaxpose.fields import Params, PoseField, PoseNetConfig
 from jaxpose.imu import Imu, ImuNoise
 from jaxpose.io import Trajectory
 from jaxpose.io_field import Factor, bspline_factor, posenet_factor
-from jaxpose.metrics import Statistics
 from jaxpose.motion import motion
 
 _SHARE = 0.95  # of the power of the speeds, below what is called the motion's bandwidth
@@ -44,28 +47,6 @@ class Frame(NamedTuple):
     t0: float  # [s]
     middle: Float[np.ndarray, "3"]  # [m]
     scale: float  # [m]
-
-
-class Inertial(NamedTuple):
-    """How far a field's derivatives are from readings, after constant biases and gravity are fitted."""
-
-    omega_rms: float  # rad/s, per axis
-    acceleration_rms: float  # m/s^2, per axis
-    gyro_bias: Float[np.ndarray, "3"]
-    gravity_world: Float[np.ndarray, "3"]  # m/s^2, in the trajectory's world
-    samples: int
-
-
-class Fitted(NamedTuple):
-    """A field and what is left of the poses that it has not seen."""
-
-    name: str
-    highest_hz: float
-    parameters: int
-    seconds: float
-    translation_m: Statistics
-    rotation_deg: Statistics
-    inertial: Inertial | None
 
 
 def posenet(span_s: float, octaves: int, layers: int, width: int, seed: int) -> Candidate:
@@ -154,6 +135,27 @@ def fit_field(
         None if imu is None else _inertial(field, params, around, imu),
     )
     return fitted, candidate.factor(span, params)
+
+
+def readings(folder: Path, trajectory: Trajectory) -> tuple[Imu, Sensor, tuple[str, ...]]:
+    """The readings within the trajectory's span, on its clock."""
+    log = euroc.load_imu(folder)
+    t = log.t0_ns * 1e-9 + np.asarray(log.imu.t, np.float64)
+    first, last = trajectory.t[[0, -1]]
+    within = (t >= first) & (t <= last)
+    if within.sum() < FEWEST:
+        raise DataError(
+            f"{folder}: expected an IMU on the clock of the poses, {first:.3f} to {last:.3f} s, got "
+            f"{t[0]:.3f} to {t[-1]:.3f} s"
+        )
+    omega, force = (np.asarray(x)[within] for x in (log.imu.omega_body, log.imu.acceleration_body))
+    rate_hz = 1 / float(np.median(np.diff(np.asarray(log.imu.t))))
+    measured = (sample_noise(omega), sample_noise(force))
+    sensor = Sensor(int(within.sum()), rate_hz, floor(log.noise, rate_hz), measured)
+    notes = ()
+    if not within.all():
+        notes = (f"{int((~within).sum())} of {len(t)} inertial readings lie outside of the poses: not used",)
+    return Imu(t[within], omega, force), sensor, notes
 
 
 def bandwidth_hz(trajectory: Trajectory) -> float:
