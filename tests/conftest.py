@@ -4,6 +4,8 @@ import os
 from pathlib import Path
 from typing import NamedTuple
 
+os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "false"  # nothing of another run, nothing left for the next
+
 import jax
 import jax.numpy as jnp
 import matplotlib

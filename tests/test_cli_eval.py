@@ -235,7 +235,7 @@ def test_wrong_calls_cost_one_line(files, tmp_path):
     io.write_tum(tmp_path / "broken" / "trajectory.txt", paths()[0])
     (tmp_path / "broken" / "results.json").write_text("{")
     for args, message in (
-        ([], "jaxpose: Expected one of .eval, export"),
+        ([], "jaxpose: Expected one of .*eval, export"),
         (["evaluate"], "eval"),
         (["eval", truth], "Missing from jaxpose eval: REFERENCE"),
         (["eval", truth, truth, "--aling", "se3"], "--align"),

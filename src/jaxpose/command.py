@@ -2,6 +2,7 @@
 
 import io
 import json
+import os
 import re
 import sys
 from collections.abc import Callable, Sequence
@@ -9,6 +10,7 @@ from contextlib import redirect_stderr
 from pathlib import Path
 from typing import Any, TypeVar
 
+import platformdirs
 import tyro
 from tqdm import tqdm
 
@@ -45,12 +47,31 @@ def parse(
 
 def guarded(name: str, action: Callable[[], str]) -> None:
     """Print what `action` returns; what the user can mend ends in one line on stderr and code 1."""
+    _keep_compiled()
     try:
         print(action())
     except (DataError, OSError) as error:
         sys.exit(f"{name}: {' '.join(str(error).split())}")
     except KeyboardInterrupt:
         sys.exit(f"{name}: interrupted")
+
+
+def _keep_compiled() -> None:
+    """Keep what is compiled in the user's cache folder, so that the next start does not compile it again.
+
+    What the user has told JAX goes first: JAX_COMPILATION_CACHE_DIR names another folder, and
+    JAX_ENABLE_COMPILATION_CACHE=false keeps nothing.
+    """
+    settings = {
+        "jax_compilation_cache_dir": platformdirs.user_cache_dir("jaxpose"),
+        "jax_persistent_cache_min_compile_time_secs": 0.0,
+    }
+    for name, value in settings.items():
+        if name.upper() in os.environ:
+            continue
+        os.environ[name.upper()] = str(value)  # for JAX, if a command loads it later, and for its children
+        if "jax" in sys.modules:
+            sys.modules["jax"].config.update(name, value)
 
 
 def step_bar() -> Callable[[str, int, int, dict[str, str]], None]:

@@ -57,7 +57,7 @@ def _stamped(p, t):
     times, poses = p["times"], p["poses"]
     i = np.clip(np.searchsorted(times, t, side="right") - 1, 0, max(len(times) - 2, 0))
     j = np.minimum(i + 1, len(times) - 1)
-    share = np.clip((t - times[i]) / np.maximum(times[j] - times[i], 1e-300), 0, 1)
+    share = np.clip((t - times[i]) / np.where(j > i, times[j] - times[i], 1), 0, 1)
     return poses[i] @ _exp(share[:, None] * _log(np.linalg.inv(poses[i]) @ poses[j]))
 
 

@@ -1,0 +1,40 @@
+"""What commands share: compiled steps are kept in the user's cache folder, unless the user said otherwise."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+BEFORE = "import jax; from jaxpose import command\n"
+LAZY = "from jaxpose import command\n"
+ACTION = """
+def action():
+    import jax
+    return str(jax.jit(lambda x: x * 2 + 1)(20.0))
+command.guarded("test", action)
+"""
+
+
+def run(program, cache, **settings):
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
+    environment |= {"XDG_CACHE_HOME": str(cache), "HOME": str(cache), **settings}
+    done = subprocess.run(
+        [sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True
+    )
+    return done.stdout.strip()
+
+
+@pytest.mark.parametrize("program", [BEFORE + ACTION, LAZY + ACTION], ids=["before", "lazy"])
+def test_compiled_steps_are_kept_for_the_next_run(tmp_path, program):
+    assert run(program, tmp_path) == "41.0"
+    kept = [file for file in tmp_path.rglob("*") if "jaxpose" in file.parts and file.is_file()]
+    assert kept
+    assert run(program, tmp_path) == "41.0"
+
+
+def test_what_the_user_told_jax_goes_first(tmp_path):
+    run(BEFORE + ACTION, tmp_path / "home", JAX_COMPILATION_CACHE_DIR=str(tmp_path / "mine"))
+    assert any((tmp_path / "mine").iterdir()) and not (tmp_path / "home").exists()
+    run(BEFORE + ACTION, tmp_path / "off", JAX_ENABLE_COMPILATION_CACHE="false")
+    assert not [file for file in (tmp_path / "off").rglob("*") if file.is_file()]
