@@ -1,12 +1,13 @@
-"""PLY files (Stanford's polygon format): the points of a cloud or the vertices of a mesh."""
+"""PLY files (Stanford's polygon format): point clouds and meshes."""
 
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int, UInt8
 
 from jaxpose.errors import DataError
+from jaxpose.io import atomic
 
 _TYPES = {
     **{"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1"},
@@ -38,6 +39,32 @@ def read_points(path: Path | str) -> Float[np.ndarray, "n 3"]:
     if len(vertices) != count:
         raise DataError(f"{path}: expected {count} vertices, got {len(vertices)}")
     return np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
+
+
+def write_ply(
+    path: Path | str,
+    points: Float[np.ndarray, "n 3"],
+    rgb: UInt8[np.ndarray, "n 3"],
+    faces: Int[np.ndarray, "m 3"] | None = None,
+) -> None:
+    """Write coloured points [m], or triangles between them too, as binary PLY in float32; atomically."""
+    vertex = np.dtype([(axis, "<f4") for axis in "xyz"] + [(c, "u1") for c in ("red", "green", "blue")])
+    vertices = np.empty(len(points), vertex)
+    for k, axis in enumerate("xyz"):
+        vertices[axis] = points[:, k]
+    for k, channel in enumerate(("red", "green", "blue")):
+        vertices[channel] = rgb[:, k]
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
+    header += [f"property float {axis}" for axis in "xyz"]
+    header += [f"property uchar {channel}" for channel in ("red", "green", "blue")]
+    triangles = np.empty(0 if faces is None else len(faces), [("count", "u1"), ("corners", "<i4", 3)])
+    if faces is not None:
+        header += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
+        triangles["count"], triangles["corners"] = 3, faces
+    with atomic(path) as temporary, temporary.open("wb") as stream:
+        stream.write(("\n".join([*header, "end_header"]) + "\n").encode())
+        stream.write(vertices.tobytes())
+        stream.write(triangles.tobytes())
 
 
 def _header(path: Path, stream: BinaryIO) -> tuple[str, int, list[tuple[str, str]], int]:

@@ -1,4 +1,4 @@
-"""What is measured on a tracked recording: cost, errors, the map, the field's own derivatives."""
+"""What is measured on a tracked recording: cost, errors, the field's own derivatives."""
 
 from functools import partial
 from typing import Any, NamedTuple
@@ -6,21 +6,16 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxpose import metrics
 from jaxpose.errors import DataError
 from jaxpose.fields import body_to_camera
 from jaxpose.imu import Imu, remove_gravity
 from jaxpose.motion import motion
-from jaxpose.plots import View
 from jaxpose.recording import Recording
-from jaxpose.slam.observe import Image, Pixels, SampleConfig, read_pixels, render_pixels
 from jaxpose.slam.run import SlamResult
 
-_VIEW_WIDTH = 160  # [px] of rendered pictures, about
-_VIEWS = 4
-_CHUNK = 4800  # rays rendered in one call
 _MOST_READINGS = 4000  # compared with the field; more are thinned
 
 
@@ -121,53 +116,3 @@ def inertial(recording: Recording, result: SlamResult) -> Inertial | None:
     gyro, accelerometer = (read_omega, omega), (read, field)
     rms = [float(np.sqrt(np.mean((a - b) ** 2))) for a, b in (gyro, accelerometer)]
     return Inertial(t, gyro, accelerometer, *rms)
-
-
-def views(recording: Recording, result: SlamResult) -> list[View]:
-    """A few frames, evenly over the recording, beside the map rendered from their estimated poses.
-
-    The measured depth plays no part in the rendering: a first pass over evenly spaced samples finds the
-    surface, a second one looks closely.
-    """
-    grid, camera = result.grid, recording.camera
-    step = max(1, round(camera.width / _VIEW_WIDTH))
-    row, column = np.mgrid[step // 2 : camera.height : step, step // 2 : camera.width : step]
-    fine = SampleConfig(band=grid.truncation, width=grid.truncation / 8)
-    reach = float(np.linalg.norm(np.subtract(grid.upper, grid.lower)))
-    evenly = int(np.clip(reach / grid.truncation * 4, 64, 256))
-    coarse = SampleConfig(front=evenly, surface=0, behind=0, band=grid.truncation, width=grid.truncation / 4)
-
-    @jax.jit
-    def render(params, T_world_cam: Float[Array, "4 4"], pixels: Pixels):
-        query, far = partial(result.scene.query, params), jnp.float32(reach)
-        unknown = pixels._replace(depth=jnp.zeros_like(pixels.depth))
-        found = render_pixels(query, T_world_cam, unknown, far, coarse)
-        surface = jnp.where(found.opacity > 0.5, found.depth, 0)
-        seen = render_pixels(query, T_world_cam, pixels._replace(depth=surface), far, fine)
-        there = (surface > 0) & (seen.opacity > 0.5)
-        return jnp.where(there[:, None], seen.rgb, 0.86), jnp.where(there, seen.depth, 0)
-
-    def view(i: int) -> View:
-        frame = recording.read(i)
-        image = Image(jnp.asarray(frame.rgb), jnp.asarray(frame.depth, jnp.float32))
-        pose = jnp.asarray(result.T_world_cam[i], jnp.float32)
-        count = row.size
-        padded = (
-            np.arange(-(-count // _CHUNK) * _CHUNK) % count
-        )  # whole chunks, so that one shape is compiled
-        parts = []
-        for chunk in padded.reshape(-1, _CHUNK):
-            pixels = read_pixels(image, camera, jnp.asarray(row.flat[chunk]), jnp.asarray(column.flat[chunk]))
-            parts.append(jax.device_get(render(result.scene_params, pose, pixels)))
-        rgb, depth = (np.concatenate(x)[:count] for x in zip(*parts, strict=True))
-        lost = ", lost" if result.lost[i] else ""
-        return View(
-            f"t = {recording.t[i]:.2f} s{lost}",
-            np.asarray(frame.rgb),
-            rgb.reshape(*row.shape, 3),
-            np.asarray(frame.depth)[row, column],
-            depth.reshape(row.shape),
-        )
-
-    count = len(recording.t)
-    return [view(i) for i in sorted({round(i) for i in np.linspace(0, count - 1, min(_VIEWS, count))})]

@@ -84,6 +84,7 @@ def report(folder: Path, results: dict[str, Any]) -> str:
             "RMSE to the tracked poses",
         ),
     ]
+    lines += _map(results["map"])
     return "\n".join(lines + _ending(folder, results, results["notes"], "trajectory.png"))
 
 
@@ -119,6 +120,19 @@ def _against_truth(results: dict[str, Any]) -> list[str]:
             "from one frame to the next",
         ))  # fmt: skip
     return lines
+
+
+def _map(quality: dict[str, Any]) -> list[str]:
+    """The map at frames it was made from, and at those held out."""
+    words = []
+    for kind, name in (("mapped", "mapped frames"), ("held_out", "held-out frames")):
+        numbers = quality[kind]
+        if numbers is not None:
+            depth = _cm(numbers["depth_l1_m"])
+            words.append(f"{numbers['psnr']:.2f} dB, depth L1 {depth} cm at {numbers['frames']} {name}")
+    if not words:
+        return []
+    return [_line("map", "; ".join(words)), _line("", quality["protocol"])]
 
 
 def _ending(folder: Path, results: dict[str, Any], notes: tuple[str, ...], picture: str) -> list[str]:

@@ -14,15 +14,18 @@ from jaxtyping import Float
 
 from jaxpose import io, plots
 from jaxpose.errors import DataError
-from jaxpose.experiments.slam_measure import Accuracy, Inertial, accuracy, cost, inertial, views
+from jaxpose.experiments.slam_map import map_quality, views
+from jaxpose.experiments.slam_measure import Accuracy, Inertial, accuracy, cost, inertial
 from jaxpose.experiments.slam_options import Options, Source, load, slam_config
 from jaxpose.experiments.slam_report import table
 from jaxpose.fields import Params, PoseField, bspline
 from jaxpose.io_camera import write_camera
 from jaxpose.io_field import bspline_factor, write_field
+from jaxpose.io_ply import write_ply
 from jaxpose.recording import Recording
 from jaxpose.slam.run import ImuMode, Progress, SlamResult
 from jaxpose.slam.run import run as track
+from jaxpose.slam.surface import cloud, mesh
 
 OnFrame = Callable[[ImuMode, Progress], None]
 
@@ -124,16 +127,31 @@ def _single(
     span = (0.0, float(recording.t[-1] - recording.t[0]))
     write_field(folder / "field.npz", span, [bspline_factor(span, result.field_params)])
     images_folder = "." if options.data is None else options.data.resolve()
+    notes = (*recording.notes, *_write_surface(folder, recording, result))
     write_camera(folder / "camera.json", recording.camera, recording.files, images_folder)
     io.write_json(folder / "config.json", options)
     results |= {
-        "notes": recording.notes,
+        "map": map_quality(recording, result),
+        "notes": notes,
         "versions": io.versions(),
         "wall_s": time.perf_counter() - started,
         "peak_rss_bytes": io.peak_rss_bytes(),
     }
     io.write_json(folder / "results.json", results)
     return results, np.full(len(recording.t), np.nan) if errors is None else errors.translation_m
+
+
+def _write_surface(folder: Path, recording: Recording, result: SlamResult) -> tuple[str, ...]:
+    """The map as a point cloud and, where scikit-image is installed, as a mesh; a note where it is not."""
+    points = cloud(result.keyframes, recording.camera, result.grid.voxel)
+    write_ply(folder / "points.ply", points.points, points.rgb)
+    try:
+        (values,) = result.scene_params
+        surface = mesh(result.grid, np.asarray(values), result.keyframes, recording.camera)
+    except ImportError:
+        return ('no mesh.ply: pip install "jaxpose[mesh]" for marching cubes',)
+    write_ply(folder / "mesh.ply", surface.points, surface.rgb, surface.faces)
+    return ()
 
 
 def _draw(

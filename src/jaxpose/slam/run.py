@@ -64,6 +64,7 @@ class SlamConfig:
     map: MapConfig = MapConfig()
     map_every_s: float = 0.15  # [s] between mapping steps
     voxel: float | None = None  # [m]; None: from the size of the room
+    hold_out: int = 0  # every n-th frame is tracked but never mapped, to measure the map on; 0: none
     keyframe_overlap: float = 0.9  # a frame that shares less with every keyframe becomes one
     imu_noise: ImuNoise = ADIS16448
 
@@ -81,6 +82,8 @@ class SlamConfig:
         for name, value in positive.items():
             if value < 1:
                 raise ValueError(f"{name}: expected 1 or more, got {value}")
+        if self.hold_out == 1 or self.hold_out < 0:
+            raise ValueError(f"hold_out: expected 0, or 2 or more, got {self.hold_out}")
 
 
 class Progress(NamedTuple):
@@ -99,6 +102,7 @@ class SlamResult(NamedTuple):
 
     T_world_cam: np.ndarray  # (n, 4, 4)
     lost: np.ndarray  # (n,) bool: tracking failed, the pose is the prediction
+    mapped: np.ndarray  # (n,) bool: the map was made from it
     iterations: np.ndarray  # (n,)
     loss: np.ndarray  # (n,)
     depth_error: np.ndarray  # (n,) [m] median
@@ -152,6 +156,7 @@ def run(
     T_world_body = [T_world_cam[0] @ T_cam_body]
     velocity, twist, offset = np.zeros(3), np.zeros(6), np.zeros(3)
     records: list[tuple[bool, Tracked | None, float]] = []
+    mapped: list[int] = []
     keyframes: list[Keyframe] = []
     world, far, mapped_at = None, 0.0, -np.inf
 
@@ -188,7 +193,8 @@ def run(
         points = _points(frame, recording, T_world_cam[-1])
         if world is None and len(points) == 0:
             raise DataError(f"{recording.name}: expected depth in the first frame, found none")
-        if not lost and len(points) and t[i] - mapped_at >= config.map_every_s:
+        held_out = config.hold_out > 0 and i % config.hold_out == config.hold_out - 1
+        if not lost and not held_out and len(points) and t[i] - mapped_at >= config.map_every_s:
             far = max(
                 far, 1.2 * float(np.percentile(np.linalg.norm(points - T_world_cam[-1][:3, 3], axis=1), 99))
             )
@@ -200,6 +206,7 @@ def run(
             )
             world = _mapped(world, image, T_world_cam[-1], keyframes, shares, far, config, generator, map_key)
             mapped_at = t[i]
+            mapped.append(i)
             if not keyframes or shares.max() < config.keyframe_overlap:
                 keyframes.append(Keyframe(i, image, T_world_cam[-1]))
         assert world is not None  # made from the first frame
@@ -209,7 +216,7 @@ def run(
         if on_frame is not None:
             on_frame(Progress(i, len(t), tracked, lost, _truth_error(recording, i, T_world_cam), seconds))
 
-    return _finish(recording, np.stack(T_world_cam), records, world, keyframes)
+    return _finish(recording, np.stack(T_world_cam), records, mapped, world, keyframes)
 
 
 def _inertial_windows(recording: Recording, config: SlamConfig) -> Callable[..., Readings]:
@@ -349,7 +356,7 @@ def _truth_error(recording: Recording, i: int, T_world_cam: list[np.ndarray]) ->
     return float(np.linalg.norm(recording.T_world_cam[i, :3, 3] - T_world_cam[i][:3, 3]))
 
 
-def _finish(recording, T_world_cam, records, world, keyframes) -> SlamResult:
+def _finish(recording, T_world_cam, records, mapped, world, keyframes) -> SlamResult:
     """One field fitted to all poses, and everything that was recorded on the way.
 
     A B-spline with a knot a frame: a PoseNet over the same 12 s of the default room stayed 1.5 cm from the
@@ -368,6 +375,7 @@ def _finish(recording, T_world_cam, records, world, keyframes) -> SlamResult:
     return SlamResult(
         T_world_cam,
         lost=np.array([lost for lost, _, _ in records]),
+        mapped=np.isin(np.arange(len(records)), mapped),
         iterations=np.array([int(x.iterations) for x in each]),
         loss=np.array([float(x.loss) for x in each]),
         depth_error=np.array([float(x.depth_error) for x in each]),
