@@ -13,6 +13,7 @@ LAYERS = (
 ).split()
 BESIDE = {
     "ekf": "imu",
+    "ekf_steps": "imu",
     "__main__": "cli",
 }  # modules named unlike their layer; imu_simulation is plainly imu's
 PACKAGE = Path(jaxpose.__file__).parent
