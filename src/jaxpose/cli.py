@@ -1,4 +1,4 @@
-"""Camera trajectories: find a field that carries them, compare them, take them out of a run.
+"""Camera trajectories: check data, find a field that carries a motion, compare, take poses out of a run.
 
 `jaxpose COMMAND --help` tells what a command takes. The experiments that make runs are
 `python -m jaxpose.experiments.rgbd_slam`, `imu_slam`, `noisy_nerf` and `planar`.
@@ -11,17 +11,19 @@ from typing import Annotated, Any
 import tyro
 
 from jaxpose import command
-from jaxpose.commands import evaluate, export, fit
+from jaxpose.commands import check, evaluate, export, fit
 from jaxpose.io import json_text
 
 _MODULES = {
+    check.Config: ("check", check),
     fit.Config: ("fit", fit),
     evaluate.Config: ("eval", evaluate),
     export.Config: ("export", export),
 }
 # All that the command line can ask for: the config of one of the commands.
 _Command = Annotated[
-    Annotated[fit.Config, tyro.conf.subcommand("fit", description=fit.__doc__)]
+    Annotated[check.Config, tyro.conf.subcommand("check", description=check.__doc__)]
+    | Annotated[fit.Config, tyro.conf.subcommand("fit", description=fit.__doc__)]
     | Annotated[evaluate.Config, tyro.conf.subcommand("eval", description=evaluate.__doc__)]
     | Annotated[export.Config, tyro.conf.subcommand("export", description=export.__doc__)],
     tyro.conf.FlagCreatePairsOff,
@@ -33,12 +35,19 @@ def main(args: Sequence[str] | None = None) -> None:
     config: Any = command.parse("jaxpose", _Command, __doc__, args, prog="jaxpose")  # pyright: ignore
     name, module = _MODULES[type(config)]
 
+    code = 0
+
     def said() -> str:
+        nonlocal code
         progress = {"on_field": _tell} if module is fit else {}
         result = module.run(config, **progress)
+        if module is check:
+            code = check.exit_code(result)
         return json_text(result) if config.json else module.report(result)
 
     command.guarded(f"jaxpose {name}", said)
+    if code:
+        sys.exit(code)
 
 
 def _tell(field: str) -> None:
