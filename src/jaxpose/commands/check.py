@@ -1,8 +1,9 @@
-"""What a set of data is, and what is wrong with it: stamps, poses, camera, depth, IMU, and whether they agree.
+"""What a set of data is, and what is wrong with it: stamps, poses, camera, depth, IMU, and how they agree.
 
-DATA is a folder of an RGB-D recording (7-Scenes, TUM, Replica, ScanNet, EuRoC, plain), of photographs with poses
-(Blender, nerfstudio, LLFF), of an IMU with truth (EuRoC), of events (DAVIS), a trajectory file (TUM, KITTI, EuRoC,
-4x4), or a folder of those: found by its files. Ends with 0 if all is well, 2 with warnings, 1 if it is unusable.
+DATA is a folder of an RGB-D recording (7-Scenes, TUM, Replica, ScanNet, EuRoC, plain), of photographs with
+poses (Blender, nerfstudio, LLFF), of an IMU with truth (EuRoC), or of events (DAVIS); a trajectory file (TUM,
+KITTI, EuRoC, 4x4), or a folder of such files. The format is found by the files. Ends with 0 if no fault is
+found, with 2 for warnings, and with 1 for data that cannot be used.
 """
 
 from dataclasses import dataclass
@@ -15,9 +16,9 @@ from jaxpose.commands.check_findings import Checked, Fact, Finding
 from jaxpose.errors import DataError
 
 _KNOWN = (
-    "an RGB-D recording (7-Scenes, TUM, Replica, ScanNet, EuRoC, or color/ and depth/ with intrinsics), photographs "
-    "(transforms.json, transforms_train.json or poses_bounds.npy), mav0/imu0 with truth, events*.txt, or "
-    "trajectories"
+    "an RGB-D recording (7-Scenes, TUM, Replica, ScanNet, EuRoC, or color/ and depth/ with intrinsics), "
+    "photographs (transforms.json, transforms_train.json or poses_bounds.npy), mav0/imu0 with truth, "
+    "events*.txt, or trajectories"
 )
 
 
@@ -49,7 +50,8 @@ def run(config: Config) -> Result:
         return Result(path, f"{form} trajectory", *checked)
     if not path.exists():
         raise DataError(f"{path}: expected {_KNOWN}, got nothing")
-    return Result(path, *_folder(path))
+    form, checked = _folder(path)
+    return Result(path, form, *checked)
 
 
 def report(result: Result) -> str:
@@ -78,7 +80,7 @@ def _verdict(result: Result) -> str:
     return f"{counts['warning']} warning{plural}" if counts["warning"] else "no fault found"
 
 
-def _folder(path: Path) -> tuple[str, tuple[Fact, ...], tuple[Finding, ...], tuple[str, ...]]:
+def _folder(path: Path) -> tuple[str, Checked]:
     """The format of a folder (or json file), in words, and what is found in it."""
     # Here, as the loaders load jax, which --help does without.
     from jaxpose.commands import check_events, check_inertial, check_photographs, check_recording
@@ -88,20 +90,20 @@ def _folder(path: Path) -> tuple[str, tuple[Fact, ...], tuple[Finding, ...], tup
 
     transforms = [path, path / "transforms_train.json", path / "transforms.json"]
     file = next((file for file in transforms if file.is_file()), None)
-    if check_event_files := path.is_dir() and check_events.event_files(path):
-        return f"DAVIS events ({check_event_files[0].name})", *check_events.check_events(path)
+    if path.is_dir() and (events := check_events.event_files(path)):
+        return f"DAVIS events ({events[0].name})", check_events.check_events(path)
     if file is not None and not (path / "color").is_dir():
         name = "Blender" if file.name == "transforms_train.json" else "nerfstudio, instant-ngp"
-        return f"photographs, {name} ({file.name})", *check_photographs.check_photographs(path, "blender")
+        return f"photographs, {name} ({file.name})", check_photographs.check_photographs(path, "blender")
     if (path / "poses_bounds.npy").is_file():
-        return "photographs, LLFF (poses_bounds.npy)", *check_photographs.check_photographs(path, "llff")
+        return "photographs, LLFF (poses_bounds.npy)", check_photographs.check_photographs(path, "llff")
     if euroc.is_here(path) and not check_inertial.has_depth(path):
-        return "EuRoC, IMU and truth without depth", *check_inertial.check_inertial(path)
+        return "EuRoC, IMU and truth without depth", check_inertial.check_inertial(path)
     try:
         form = recordings.find_format(path)
     except DataError:
         checked: Checked | None = check_trajectories(path)
         if checked is None:
             raise DataError(f"{path}: expected {_KNOWN}, got {found(path)}") from None
-        return "folder of trajectories", *checked
-    return f"RGB-D recording ({form})", *check_recording.check_recording(path, form)
+        return "folder of trajectories", checked
+    return f"RGB-D recording ({form})", check_recording.check_recording(path, form)

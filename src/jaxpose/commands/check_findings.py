@@ -1,6 +1,6 @@
 """What a check of data says: facts, findings, and the notes of loaders."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Literal, NamedTuple
 
 Severity = Literal["ok", "warning", "error"]
@@ -11,7 +11,7 @@ class Fact(NamedTuple):
 
     name: str
     text: str
-    numbers: dict[str, float | int | str | None]
+    numbers: Mapping[str, float | str]
 
 
 class Finding(NamedTuple):

@@ -24,7 +24,7 @@ _UNITS = {"m/s^2": 1.0, "g": 1 / _STANDARD, "cm/s^2 (Gal)": 100.0, "mm/s^2": 1e3
 
 
 class _Match(NamedTuple):
-    """How body rates of the poses and of a gyroscope agree best: rate = R_body_imu (reading - bias) / ratio."""
+    """How rates of the poses and of a gyroscope agree best: rate = R_body_imu (reading - bias) / ratio."""
 
     correlation: float
     offset_s: float  # reading at t + offset is the motion at t
@@ -46,44 +46,44 @@ def check_imu(
         "world-to-body poses (inverted)": np.linalg.inv(T_world_body),
         f"quaternions in the order {'xyzw' if read_as == 'wxyz' else 'wxyz'}": reorder(T_world_body, read_as),
     }
-    given, *others = matches = [_match(imu, t, T) for T in rates.values()]
-    if given is None:
+    matches = {name: match for name, T in rates.items() if (match := _match(imu, t, T))}
+    if len(matches) < len(rates):
         note = "the poses turn too little, or overlap too little with the IMU, to test it against them"
         return Checked(notes=(note,))
-    off_deg = [np.degrees(_angle(match.R_body_imu @ R_body_imu.T)) for match in matches if match]
-    text = f"gyroscope and poses: correlation {given.correlation:.3f}, clock offset {1e3 * given.offset_s:.1f} ms, "
-    text += f"mounting {off_deg[0]:.1f} deg from the stated, bias {np.round(given.bias, 4).tolist()} rad/s"
-    numbers = {
-        "correlation": given.correlation,
-        "offset_s": given.offset_s,
-        "rotation_deg": float(off_deg[0]),
-    }
+    given = matches["poses as read"]
+    off_deg = {name: _angle_deg(match.R_body_imu @ R_body_imu.T) for name, match in matches.items()}
+    off = off_deg["poses as read"]
+    text = f"gyroscope and poses: correlation {given.correlation:.3f}, clock offset "
+    text += f"{1e3 * given.offset_s:.1f} ms, mounting {off:.1f} deg from the stated, "
+    text += f"bias {np.round(given.bias, 4).tolist()} rad/s"
+    numbers = {"correlation": given.correlation, "offset_s": given.offset_s, "rotation_deg": off}
     numbers |= {"gyro_ratio": given.ratio, "gyro_bias": float(np.linalg.norm(given.bias))}
     fact = Fact("IMU and poses", text, numbers)
+    force = _force_unit(imu)
     if given.correlation < _AGREE:
-        return Checked((fact,), (_wrong_poses(tuple(rates), matches, off_deg), *_force_unit(imu)))
-    findings = [*_rates(given, off_deg[0]), *_force_unit(imu)]
-    if all(finding.severity == "ok" for finding in _force_unit(imu)):
-        findings += _gravity(imu, t + given.offset_s, T_world_body @ _turned(R_body_imu))
+        return Checked((fact,), (_wrong_poses(matches, off_deg), force))
+    findings = [*_rates(given, off), force]
+    if force.severity == "ok":
+        findings.append(_gravity(imu, t + given.offset_s, T_world_body @ _turned(R_body_imu)))
     return Checked((fact,), tuple(findings))
 
 
-def _wrong_poses(names: tuple[str, ...], matches: list, off_deg: list) -> Finding:
+def _wrong_poses(matches: dict[str, _Match], off_deg: dict[str, float]) -> Finding:
     """What has to be done with the poses for them to turn as the gyroscope says."""
     test, expected = "IMU and poses", "poses that turn as the gyroscope says"
-    found = f"a correlation of {matches[0].correlation:.2f} at best"
-    top = max(match.correlation for match in matches)
-    if top < max(_AGREE, matches[0].correlation + _BETTER):
+    given = matches["poses as read"].correlation
+    found = f"a correlation of {given:.2f} at best"
+    top = max(match.correlation for match in matches.values())
+    if top < max(_AGREE, given + _BETTER):
         fix = "check that the IMU belongs to these poses, by the same clock"
         return Finding("warning", test, found, expected, fix)
-    # Inverted poses and misread quaternions turn alike, but for a constant rotation: mounting tells them apart.
-    near = [k for k, match in enumerate(matches) if match.correlation > top - _SAME]
-    best = min(near, key=lambda k: off_deg[k])
-    found += f", but {matches[best].correlation:.2f} with {names[best]}"
-    fix = "write quaternions in the format's order" if "quaternion" in names[best] else "invert the poses"
-    return Finding(
-        "warning", "quaternion order" if "quaternion" in names[best] else test, found, expected, fix
-    )
+    # Inverted poses and misread quaternions turn alike, but for a constant rotation: the mounting tells.
+    near = [name for name, match in matches.items() if match.correlation > top - _SAME]
+    best = min(near, key=lambda name: off_deg[name])
+    found += f", but {matches[best].correlation:.2f} with {best}"
+    if "quaternion" in best:
+        return Finding("warning", "quaternion order", found, expected, "write them in the format's order")
+    return Finding("warning", test, found, expected, "invert the poses")
 
 
 def _rates(match: _Match, off_deg: float) -> list[Finding]:
@@ -114,12 +114,12 @@ def _rates(match: _Match, off_deg: float) -> list[Finding]:
     return findings
 
 
-def _force_unit(imu: Imu) -> list[Finding]:
+def _force_unit(imu: Imu) -> Finding:
     """The accelerometer's magnitude is gravity's most of the time."""
     norm = float(np.median(np.linalg.norm(np.asarray(imu.acceleration_body), axis=1)))
     fits = [unit for unit, factor in _UNITS.items() if abs(norm / (_STANDARD * factor) - 1) < 0.15]
     if "m/s^2" in fits:
-        return [Finding("ok", "accelerometer unit", f"{norm:.4g} m/s^2 at the median, gravity's")]
+        return Finding("ok", "accelerometer unit", f"{norm:.4g} m/s^2 at the median, gravity's")
     expected = f"about {_STANDARD:.2f} m/s^2 at the median"
     found = f"{norm:.4g}" + (f": readings in {fits[0]}" if fits else "")
     fix = (
@@ -127,10 +127,10 @@ def _force_unit(imu: Imu) -> list[Finding]:
         if fits
         else "check its unit, and whether gravity was removed"
     )
-    return [Finding("warning", "accelerometer unit", found, expected, fix)]
+    return Finding("warning", "accelerometer unit", found, expected, fix)
 
 
-def _gravity(imu: Imu, t: Float[np.ndarray, " n"], T_world_imu: Float[np.ndarray, "n 4 4"]) -> list[Finding]:
+def _gravity(imu: Imu, t: Float[np.ndarray, " n"], T_world_imu: Float[np.ndarray, "n 4 4"]) -> Finding:
     """Whether the specific force, turned into the world, is gravity's on average."""
     at = np.asarray(imu.t)
     inside = (at >= t[0]) & (at <= t[-1])
@@ -141,14 +141,14 @@ def _gravity(imu: Imu, t: Float[np.ndarray, " n"], T_world_imu: Float[np.ndarray
     test, expected = "gravity", "a specific force that points up, along z of the world"
     told = f"{np.round(up, 2).tolist()} m/s^2 on average in the world"
     if off > 180 - _OFF_DEG:
-        return [Finding("warning", test, f"{told}, down", expected, "change the sign of the accelerometer")]
+        return Finding("warning", test, f"{told}, down", expected, "change the sign of the accelerometer")
     if off > _OFF_DEG:
         fix = "turn the world upright, or check that IMU and poses have the same body"
-        return [Finding("warning", test, f"{told}, {off:.1f} deg off", expected, fix)]
+        return Finding("warning", test, f"{told}, {off:.1f} deg off", expected, fix)
     if abs(np.linalg.norm(up) - _STANDARD) > _MOST_BIAS:
         fix = "calibrate the accelerometer: it has a bias along the vertical, or a wrong scale"
-        return [Finding("warning", test, told, f"{_STANDARD:.2f} m/s^2 within {_MOST_BIAS:g}", fix)]
-    return [Finding("ok", test, f"{told}, {off:.1f} deg off z")]
+        return Finding("warning", test, told, f"{_STANDARD:.2f} m/s^2 within {_MOST_BIAS:g}", fix)
+    return Finding("ok", test, f"{told}, {off:.1f} deg off z")
 
 
 def _match(imu: Imu, t: Float[np.ndarray, " n"], T: Float[np.ndarray, "n 4 4"]) -> _Match | None:
@@ -194,8 +194,8 @@ def _match(imu: Imu, t: Float[np.ndarray, " n"], T: Float[np.ndarray, "n 4 4"]) 
     return _Match(correlation, offset, R_body_imu, ratio, bias)
 
 
-def _angle(R: Float[np.ndarray, "3 3"]) -> float:
-    return float(Rotation.from_matrix(R).magnitude())
+def _angle_deg(R: Float[np.ndarray, "3 3"]) -> float:
+    return float(np.degrees(Rotation.from_matrix(R).magnitude()))
 
 
 def _turned(R: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4 4"]:

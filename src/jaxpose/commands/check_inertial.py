@@ -1,6 +1,7 @@
 """Checks of the EuRoC layout's IMU and truth, which need no images."""
 
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -12,7 +13,11 @@ from jaxpose.data import euroc
 from jaxpose.data.euroc_files import sensors
 from jaxpose.errors import DataError
 
-_FILES = {"imu0": "warning", "cam0": "warning", "state_groundtruth_estimate0": "note"}
+_FILES: dict[str, Literal["note", "warning"]] = {
+    "imu0": "warning",
+    "cam0": "warning",
+    "state_groundtruth_estimate0": "note",
+}
 
 
 def has_depth(path: Path) -> bool:

@@ -55,7 +55,7 @@ def check_poses(
                 Finding(
                     "warning",
                     "jumps",
-                    f"{len(jumps)} that are more, the largest {steps[worst]:.3g} m after {t[worst] - t[0]:.4g} s",
+                    f"{len(jumps)} beyond, the largest {steps[worst]:.3g} m after {t[worst] - t[0]:.4g} s",
                     f"steps at up to {_JUMP:g} times the speed of 95% of them ({fast:.3g} m/s)",
                     "cut the trajectory there, or leave these poses out",
                 )
@@ -110,7 +110,7 @@ def _other_order(T: Float[np.ndarray, "n 4 4"], written: Quaternions, other: Ord
         given, meant = _explained(some), _explained(reorder(some, written.order))
         if meant > given + _MORE_EXPLAINED:
             reasons.append(
-                f"turning about a pivot or around a point explains {meant:.0%} of the positions, not {given:.0%}"
+                f"turning about one point then explains {meant:.0%} of the positions, not {given:.0%}"
             )
     return reasons
 

@@ -54,7 +54,8 @@ def check_camera(camera: Camera) -> Checked:
     numbers = {"width": width, "height": height, "fov_x_deg": angles[0], "fov_y_deg": angles[1]}
     numbers |= dict(zip(("fx", "fy", "cx", "cy"), camera[:4], strict=True))
     if not all(_ANGLES[0] < angle < _ANGLES[1] for angle in angles) or off > _OFF_CENTRE:
-        found = f"{angles[0]:.1f} x {angles[1]:.1f} deg, centre {camera.cx:.4g}, {camera.cy:.4g} in {width}x{height}"
+        found = f"{angles[0]:.1f} x {angles[1]:.1f} deg, centre {camera.cx:.4g}, {camera.cy:.4g} "
+        found += f"in {width}x{height}"
         expected = f"a field of view of {_ANGLES[0]:g} to {_ANGLES[1]:g} deg and a centre in the middle"
         fix = "check that the intrinsics are for images of this size"
         finding = Finding("warning", "intrinsics", found, expected, fix)
@@ -68,7 +69,7 @@ def _frames(recording: Recording) -> Checked:
     steps = np.diff(t)
     period = float(np.median(steps)) if len(steps) else np.nan
     text = f"{len(t)}"
-    numbers: dict[str, float | int | str | None] = {"count": len(t)}
+    numbers: dict[str, float | str] = {"count": len(t)}
     if len(steps):
         text += f" at {1 / period:.4g} Hz over {t[-1]:.4g} s, largest gap {steps.max():.3g} s"
         text += f" at {t[steps.argmax()]:.4g} s"
@@ -83,7 +84,8 @@ def _depth(recording: Recording) -> Checked:
     valid = depth[depth > 0]
     covered = valid.size / depth.size
     near, middle, far = (float(x) for x in np.quantile(valid, [0.01, 0.5, 0.99]))
-    text = f"{covered:.0%} of the pixels, {near:.3g} to {far:.3g} m, median {middle:.3g} m (98% of {len(rows)} frames)"
+    text = f"{covered:.0%} of the pixels, 98% of it from {near:.3g} to {far:.3g} m, median {middle:.3g} m "
+    text += f"({len(rows)} frames)"
     numbers = {"coverage": covered, "near_m": near, "median_m": middle, "far_m": far}
     finding = Finding("ok", "depth", f"{covered:.0%} of the pixels, median {middle:.3g} m")
     if not _DEPTHS[0] < middle < _DEPTHS[1]:
@@ -98,7 +100,7 @@ def _depth(recording: Recording) -> Checked:
 def _truth(recording: Recording) -> Checked:
     if recording.T_world_cam is None:
         return Checked((Fact("truth", "none", {"coverage": 0.0}),))
-    finite = np.isfinite(recording.T_world_cam).all((1, 2))
+    finite = np.asarray(np.isfinite(recording.T_world_cam).all((1, 2)))
     t = recording.t[finite]
     text = f"{finite.sum()} of {len(finite)} frames have a pose, from {t[0]:.4g} to {t[-1]:.4g} s"
     fact = Fact("truth", text, {"coverage": float(finite.mean()), "poses": int(finite.sum())})

@@ -67,8 +67,8 @@ def check_reprojection(recording: Recording) -> Checked:
         )
         return Checked((), (Finding("warning", test, found, f"{_GIVEN[0]}, depth in metres", fix),))
     if scores.in_view[given] < _FEW:
-        found = f"{scores.in_view[given]:.0%} of the depth that lands in the other image agreeing, {told}, and no "
-        found += "more under any convention that was tried"
+        found = f"{scores.in_view[given]:.0%} of the depth in the other image's view agreeing, {told}, and "
+        found += "not more under any convention that was tried"
         fix = "check that poses belong to these frames, depth to this colour camera, and the intrinsics"
         return Checked((), (Finding("warning", test, found, "poses that carry depth onto depth", fix),))
     others = share.copy()

@@ -44,12 +44,12 @@ def check_stamps(
     steps = np.diff(t)
     period = float(np.median(steps[steps > 0])) if (steps > 0).any() else np.nan
     span, widest = float(np.ptp(t)) if len(t) else 0.0, int(steps.argmax()) if len(steps) else 0
-    text, numbers = f"{len(t)}", {"count": len(t)}
+    text, numbers = f"{len(t)}", {}
     if np.isfinite(period):
         gap = float(steps[widest])
         text += f" at {1 / period:.4g} Hz over {span:.4g} s ({unit} in the file)"
         text += f", largest gap {gap:.3g} s at {t[widest] - t[0]:.4g} s"
-        numbers |= {"rate_hz": 1 / period, "span_s": span, "largest_gap_s": gap, "unit": unit}
+        numbers = {"rate_hz": 1 / period, "span_s": span, "largest_gap_s": gap, "unit": unit}
         numbers |= {"largest_gap_at_s": float(t[widest] - t[0]), "first_stamp_s": float(t[0])}
     findings, notes = [*_order(what, t), *_unit(what, t, period, unit)], []
     wide = np.flatnonzero(steps > _GAP * period)
@@ -63,7 +63,7 @@ def check_stamps(
             findings.append(Finding("warning", "gaps", found, expected, "cut the recording at the gaps"))
     elif not findings and np.isfinite(period):
         findings.append(Finding("ok", "stamps", f"{what}: increasing, no gap, plausible in {unit}"))
-    return Checked((Fact(what, text, numbers),), tuple(findings), tuple(notes))
+    return Checked((Fact(what, text, {"count": len(t), **numbers}),), tuple(findings), tuple(notes))
 
 
 def _order(what: str, t: Float[np.ndarray, " n"]) -> list[Finding]:
