@@ -12,8 +12,6 @@ from scipy.spatial.transform import Rotation
 from jaxpose import cli, io
 from jaxpose.commands import check
 from jaxpose.commands.check import Config, exit_code, report
-from jaxpose.data.synthetic import RoomConfig, room
-from jaxpose.imu import QUIET
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenCV's axes to OpenGL's
 T0 = 1_403_715_524.0
@@ -29,7 +27,7 @@ def faults(result):
     return " | ".join(f"{f.test}: {f}" for f in result.findings if f.severity != "ok")
 
 
-def tests(result, severity="warning"):
+def named_tests(result, severity="warning"):
     return [finding.test for finding in result.findings if finding.severity == severity]
 
 
@@ -41,7 +39,7 @@ def flipped(T):
     return T @ FLIP
 
 
-# --- RGB-D recordings -----------------------------------------------------------------------------------------
+# --- RGB-D recordings -------------------------------------------------------------------------------------
 
 
 class Clip(NamedTuple):
@@ -55,22 +53,30 @@ class Clip(NamedTuple):
 
 @pytest.fixture(scope="module")
 def clip():
-    recording = room(
-        RoomConfig(
-            duration_s=5.0,
-            rate_hz=4.0,
-            imu_rate_hz=20.0,
-            width=80,
-            height=60,
-            depth_noise=0.0,
-            holes=False,
-            imu_noise=QUIET,
-        )
-    )
-    frames = [recording.read(i) for i in range(len(recording.t))]
-    return Clip(
-        recording.camera, recording.t, np.stack([frame.depth for frame in frames]), recording.T_world_cam
-    )
+    """A camera in a room of 5 x 4 x 2.6 m with three balls in it, turning and walking; exact depth."""
+    t = np.arange(21) / 4
+    T = np.tile(np.eye(4), (21, 1, 1))
+    turn = Rotation.from_euler("xyz", np.stack([0.15 * np.sin(2 * t), 0.35 * t, 0.1 * np.cos(t)], -1))
+    T[:, :3, :3] = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]) @ turn.as_matrix()
+    T[:, :3, 3] = np.stack([0.8 * np.sin(0.5 * t), 0.6 * np.cos(0.7 * t), 1.3 + 0.2 * np.sin(t)], -1)
+    camera = (73.0, 73.0, 39.5, 29.5)
+    v, u = np.mgrid[0:60, 0:80]
+    rays = np.stack([(u - 39.5) / 73, (v - 29.5) / 73, np.ones((60, 80))], axis=-1)
+    return Clip(camera, t, np.stack([cast(pose[:3, 3], rays @ pose[:3, :3].T) for pose in T]), T)
+
+
+def cast(origin, rays):
+    """How many times each ray reaches from the origin to the room's walls or a ball."""
+    low, high = np.array([-2.5, -2, 0]), np.array([2.5, 2, 2.6])
+    with np.errstate(divide="ignore"):
+        reach = np.where(rays > 0, (high - origin) / rays, (low - origin) / rays).min(-1)
+    for centre, radius in (([1.7, 1.2, 0.6], 0.6), ([-1.6, 1.3, 1.5], 0.5), ([1.8, -1.2, 1.2], 0.5)):
+        to = np.array(centre) - origin
+        along, size = rays @ to, (rays**2).sum(-1)
+        root = along**2 - size * (to @ to - radius**2)
+        hit = (along - np.sqrt(np.maximum(root, 0))) / size
+        reach = np.where((root > 0) & (hit > 0), np.minimum(reach, hit), reach)
+    return reach
 
 
 def write_images(folder, clip, save, per_metre):
@@ -112,7 +118,7 @@ def test_a_good_recording_has_no_fault(tmp_path, clip, save):
     numbers = {fact.name: fact.numbers for fact in result.facts}
     assert numbers["frames"]["count"] == 21 and numbers["frames"]["rate_hz"] == pytest.approx(4)
     assert numbers["times.txt"]["first_stamp_s"] == pytest.approx(T0) and numbers["truth"]["coverage"] == 1
-    assert numbers["camera"]["fov_x_deg"] == pytest.approx(np.degrees(2 * np.arctan(320 / 585)))
+    assert numbers["camera"]["fov_x_deg"] == pytest.approx(np.degrees(2 * np.arctan(40 / 73)))
     assert numbers["depth"]["coverage"] == 1
     assert numbers["depth"]["median_m"] == pytest.approx(np.median(clip.depth[::5]), rel=0.01)
     assert "OpenCV axes, and the depth's scale fit" in report(result)
@@ -137,7 +143,7 @@ def test_a_good_recording_has_no_fault(tmp_path, clip, save):
 )
 def test_conventions_and_scales_are_named(tmp_path, clip, save, fault, named):
     result = checked(plain(tmp_path, clip, save, **fault))
-    assert tests(result) == ["poses and depth"] and exit_code(result) == 2
+    assert named_tests(result) == ["poses and depth"] and exit_code(result) == 2
     words = faults(result).replace(": so", ";")
     assert all(part in words for part in named.split("; ")), words
 
@@ -158,7 +164,9 @@ def test_tum_in_its_own_conventions_and_in_others(tmp_path, clip, save):
     result = checked(tum(tmp_path / "order", clip, save, order=(3, 0, 1, 2)))
     assert "quaternions in the order wxyz, read as xyzw" in faults(result)
     result = checked(tum(tmp_path / "ns", clip, save, seconds=1e-9))
-    assert set(tests(result)) == {"unit of time"} and "convert the stamps from ns to s" in faults(result)
+    assert set(named_tests(result)) == {"unit of time"} and "convert the stamps from ns to s" in faults(
+        result
+    )
 
 
 def test_a_gap_in_the_frames_is_found_where_it_is(tmp_path, clip, save):
@@ -166,7 +174,7 @@ def test_a_gap_in_the_frames_is_found_where_it_is(tmp_path, clip, save):
     late = np.where(np.arange(21) > 9, 3.0, 0.0)
     np.savetxt(folder / "times.txt", T0 + clip.t + late, fmt="%.6f")
     result = checked(folder)
-    assert "gaps" in tests(result) and "3.25 s at 2.25 s" in faults(result)
+    assert "gaps" in named_tests(result) and "3.25 s at 2.25 s" in faults(result)
 
 
 def test_what_a_loader_refuses_is_unusable(tmp_path, clip, save):
@@ -177,7 +185,7 @@ def test_what_a_loader_refuses_is_unusable(tmp_path, clip, save):
     assert "unusable" in report(result)
 
 
-# --- an IMU and truth -----------------------------------------------------------------------------------------
+# --- an IMU and truth -------------------------------------------------------------------------------------
 
 
 def turning(t):
@@ -250,18 +258,18 @@ def test_a_good_imu_has_no_fault(tmp_path):
 )
 def test_faults_of_an_imu_are_named(tmp_path, fault, test, words):
     result = checked(euroc(tmp_path, **fault))
-    assert test in tests(result) and words in faults(result), faults(result)
+    assert test in named_tests(result) and words in faults(result), faults(result)
     assert exit_code(result) == 2
 
 
 def test_a_turned_imu_is_named_with_its_rotation(tmp_path):
     mounting = Rotation.from_euler("z", 90, degrees=True)
     result = checked(euroc(tmp_path, mounting=mounting))
-    assert "IMU rotation" in tests(result) and "90.0 deg" in faults(result)
+    assert "IMU rotation" in named_tests(result) and "90.0 deg" in faults(result)
     assert "[[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]" in faults(result).replace("-0.0", "0.0")
 
 
-# --- trajectories ---------------------------------------------------------------------------------------------
+# --- trajectories -----------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -303,12 +311,12 @@ def test_a_good_trajectory_has_no_fault(tmp_path, around):
 def test_units_of_stamps_are_named(tmp_path, around, seconds, unit, start):
     moved = around._replace(t=around.t - T0 + start)
     result = checked(write_rows(tmp_path / "t.txt", moved, seconds=seconds))
-    assert "unit of time" in tests(result) and unit in faults(result)
+    assert "unit of time" in named_tests(result) and unit in faults(result)
 
 
 def test_an_order_of_quaternions_is_named(tmp_path, around):
     result = checked(write_rows(tmp_path / "t.txt", around, order=(3, 0, 1, 2)))
-    assert tests(result) == ["quaternion order"] and "explains" in faults(result)
+    assert named_tests(result) == ["quaternion order"] and "explains" in faults(result)
     first = around._replace(T=np.linalg.inv(around.T[0]) @ around.T)
     result = checked(write_rows(tmp_path / "first.txt", first, order=(3, 0, 1, 2)))
     assert "is then the identity" in faults(result)
@@ -318,7 +326,7 @@ def test_jumps_and_stamps_out_of_order_are_found(tmp_path, around):
     T = around.T.copy()
     T[200:, 0, 3] += 3.0
     result = checked(write_rows(tmp_path / "jump.txt", around._replace(T=T)))
-    assert "jumps" in tests(result) and "after 9.95 s" in faults(result)
+    assert "jumps" in named_tests(result) and "after 9.95 s" in faults(result)
     t = around.t.copy()
     t[100] -= 1
     result = checked(write_rows(tmp_path / "back.txt", around._replace(t=t)))
@@ -328,7 +336,7 @@ def test_jumps_and_stamps_out_of_order_are_found(tmp_path, around):
     assert "200 of 400 that repeat" in faults(result)
 
 
-# --- photographs ----------------------------------------------------------------------------------------------
+# --- photographs ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -346,7 +354,7 @@ def test_photographs_look_at_their_place(tmp_path, around, save, change, words):
     assert bool(words) == bool(faults(result))
 
 
-# --- events, and the command ----------------------------------------------------------------------------------
+# --- events, and the command ------------------------------------------------------------------------------
 
 
 def test_events_outside_the_sensor_are_found(tmp_path):
@@ -379,7 +387,7 @@ def test_the_command_ends_with_its_code(tmp_path, around, capsys):
         assert line.startswith("jaxpose check: ") and line.endswith(f"got {found}") and "\n" not in line
 
 
-# --- real recordings ------------------------------------------------------------------------------------------
+# --- real recordings --------------------------------------------------------------------------------------
 
 
 @pytest.mark.data
@@ -429,7 +437,7 @@ def test_faults_put_into_a_real_clip_are_named(data_dir, tmp_path, save, change,
         T = np.loadtxt(folder / f"{stem}.pose.txt")
         np.savetxt(tmp_path / f"{stem}.pose.txt", change(T))
     result = checked(tmp_path)
-    assert tests(result) == ["poses and depth"] and words in faults(result)
+    assert named_tests(result) == ["poses and depth"] and words in faults(result)
 
 
 @pytest.mark.data
@@ -446,4 +454,4 @@ def test_real_quaternions_in_the_other_order_are_named(data_dir, tmp_path, name)
     else:
         text = "\n".join(" ".join([*row[:4], row[7], *row[4:7]]) for row in rows)
     (tmp_path / "t.txt").write_text(text)
-    assert tests(checked(tmp_path / "t.txt")) == ["quaternion order"]
+    assert named_tests(checked(tmp_path / "t.txt")) == ["quaternion order"]

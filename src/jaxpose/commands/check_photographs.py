@@ -50,34 +50,33 @@ def _look(T: Float[np.ndarray, "n 4 4"]) -> Checked:
 
     Photographs of one object or place, seen from around or from one side: it lies in front of the cameras.
     """
-    test = "viewing directions"
+    test, expected = "viewing directions", "cameras that look at a common place"
     front, apart = _common_point(T)
-    if front is None:
-        return Checked(notes=("optical axes are all but parallel: their convention is not tested",))
     if apart > _MEET:
         turned_front, turned_apart = _common_point(np.linalg.inv(T))
-        if turned_front is not None and turned_apart < _MEET and turned_apart < apart / 3:
-            axes = "OpenGL" if turned_front < 0.5 else "OpenCV"
-            found = f"axes that meet nowhere, but do if poses are world-to-camera ({axes} axes after loading)"
-            expected = "cameras that look at a common place"
+        if turned_apart < _MEET and turned_apart < apart / 3:
+            axes = "" if turned_front > 0.5 else " in the other axes (OpenCV, OpenGL)"
+            found = f"optical axes that do not meet, but do with world-to-camera poses{axes}"
             return Checked((), (Finding("warning", test, found, expected, "invert the poses"),))
-        return Checked(notes=("the cameras look at no common place: their convention is not tested",))
+        return Checked(notes=("the optical axes meet nowhere: the poses' convention is not tested",))
     if front < 0.5:
         found = f"one that lies behind {1 - front:.0%} of them: they look outward, or their axes are flipped"
-        expected = "cameras that look at their common place"
         fix = "if they do not look outward, turn the camera axes (OpenCV for OpenGL: y and z change sign)"
         return Checked((), (Finding("warning", test, found, expected, fix),))
     found = f"the point where the optical axes meet lies in front of {front:.0%} of the cameras"
     return Checked((), (Finding("ok", test, found),))
 
 
-def _common_point(T: Float[np.ndarray, "n 4 4"]) -> tuple[float | None, float]:
-    """Share of the cameras that have the point nearest to all axes in front, and how far axes miss it."""
+def _common_point(T: Float[np.ndarray, "n 4 4"]) -> tuple[float, float]:
+    """Share of the cameras that have the point nearest to all axes in front, and how far axes miss it.
+
+    As a share of the distance to it; infinity for axes that are all but parallel.
+    """
     axes, centres = T[:, :3, 2], T[:, :3, 3]
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     total = across.mean(0)
     if np.linalg.eigvalsh(total)[0] < _PARALLEL:
-        return None, np.inf
+        return 0.0, np.inf
     point = np.linalg.solve(total, np.einsum("nij,nj->i", across, centres) / len(T))
     to = point - centres
     missed = np.linalg.norm(np.einsum("nij,nj->ni", across, to), axis=1)
