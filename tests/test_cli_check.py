@@ -185,6 +185,12 @@ def test_what_a_loader_refuses_is_unusable(tmp_path, clip, save):
     assert "unusable" in report(result)
 
 
+def test_a_camera_at_rest_tells_nothing(tmp_path, clip, save):
+    still = clip._replace(depth=clip.depth[[0] * 21], T_world_cam=clip.T_world_cam[[0] * 21])
+    result = checked(plain(tmp_path, still, save))
+    assert faults(result) == "" and any("moves too little" in note for note in result.notes)
+
+
 # --- an IMU and truth -------------------------------------------------------------------------------------
 
 
@@ -267,6 +273,24 @@ def test_a_turned_imu_is_named_with_its_rotation(tmp_path):
     result = checked(euroc(tmp_path, mounting=mounting))
     assert "IMU rotation" in named_tests(result) and "90.0 deg" in faults(result)
     assert "[[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]" in faults(result).replace("-0.0", "0.0")
+
+
+def test_truth_of_motion_capture_is_read(tmp_path):
+    folder = euroc(tmp_path, late_s=0.05) / "mav0"
+    (folder / "state_groundtruth_estimate0").rename(folder / "mocap0")
+    rows = [line.split(",")[:8] for line in (folder / "mocap0/data.csv").read_text().splitlines()]
+    (folder / "mocap0/data.csv").write_text("\n".join(map(",".join, rows)))
+    assert named_tests(checked(tmp_path)) == ["clock offset"]
+
+
+def test_without_truth_the_readings_are_still_checked(tmp_path):
+    folder = euroc(tmp_path) / "mav0"
+    (folder / "state_groundtruth_estimate0/data.csv").unlink()
+    result = checked(tmp_path)
+    assert faults(result) == "" and any("no truth to compare" in note for note in result.notes)
+    (folder / "imu0/data.csv").unlink()
+    (folder / "imu0/sensor.yaml").unlink()
+    assert exit_code(checked(tmp_path)) == 1
 
 
 # --- trajectories -----------------------------------------------------------------------------------------
@@ -455,3 +479,42 @@ def test_real_quaternions_in_the_other_order_are_named(data_dir, tmp_path, name)
         text = "\n".join(" ".join([*row[:4], row[7], *row[4:7]]) for row in rows)
     (tmp_path / "t.txt").write_text(text)
     assert named_tests(checked(tmp_path / "t.txt")) == ["quaternion order"]
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(("frames", "words"), [(0, ""), (2, "the poses of 70 ms earlier")])
+def test_poses_of_another_clock_are_named(data_dir, tmp_path, frames, words):
+    folder = data_dir / "7scenes_redkitchen" / "seq-01"
+    os.symlink(data_dir / "7scenes_redkitchen" / "camera-intrinsics.txt", tmp_path / "camera-intrinsics.txt")
+    for i in range(240):
+        for kind, j in (("color.jpg", i), ("depth.png", i), ("pose.txt", i + frames)):
+            os.symlink(folder / f"frame-{j:06d}.{kind}", tmp_path / f"frame-{i:06d}.{kind}")
+    result = checked(tmp_path)
+    assert named_tests(result) == (["clock of poses"] if frames else []) and words in faults(result)
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(
+    ("fault", "test", "words"),
+    [("degrees", "gyroscope unit", "degrees/s"), ("late", "clock offset", "ms late"), ("order", "", "xyzw")],
+)
+def test_faults_put_into_real_readings_are_named(data_dir, tmp_path, fault, test, words):
+    source = data_dir / "euroc_V1_02_medium" / "mav0"
+    for name in ("imu0", "state_groundtruth_estimate0"):
+        rows = [line.split(",") for line in (source / name / "data.csv").read_text().splitlines()[1:9000]]
+        for row in rows:
+            if fault == "degrees" and name == "imu0":
+                row[1:4] = [repr(float(x) * 180 / np.pi) for x in row[1:4]]
+            if fault == "late" and name == "imu0":
+                row[0] = str(int(row[0]) + 50_000_000)
+            if fault == "order" and name != "imu0":
+                row[4:8] = [*row[5:8], row[4]]
+        (tmp_path / "mav0" / name).mkdir(parents=True)
+        (tmp_path / "mav0" / name / "data.csv").write_text("\n".join(map(",".join, rows)))
+    (tmp_path / "mav0/imu0/sensor.yaml").write_text((source / "imu0/sensor.yaml").read_text())
+    result = checked(tmp_path)
+    if fault == "order":  # by the signs, and by the gyroscope
+        assert named_tests(result) == ["quaternion order", "quaternion order"]
+    else:
+        assert named_tests(result) == [test]
+    assert words in faults(result)

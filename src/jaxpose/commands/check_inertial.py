@@ -4,7 +4,9 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from jaxtyping import Float
 
+from jaxpose import io
 from jaxpose.commands.check_findings import Checked, Fact, Finding, join, unusable
 from jaxpose.commands.check_imu import check_imu
 from jaxpose.commands.check_poses import Quaternions, check_poses
@@ -13,10 +15,11 @@ from jaxpose.data import euroc
 from jaxpose.data.euroc_files import sensors
 from jaxpose.errors import DataError
 
+_TRUTHS = ("state_groundtruth_estimate0", "mocap0")  # of EuRoC, of TUM-VI
 _FILES: dict[str, Literal["note", "warning"]] = {
     "imu0": "warning",
     "cam0": "warning",
-    "state_groundtruth_estimate0": "note",
+    **dict.fromkeys(_TRUTHS, "note"),
 }
 
 
@@ -34,25 +37,23 @@ def check_inertial(path: Path) -> Checked:
         file = mav0 / name / "data.csv"
         if file.is_file() and (table := read_table(file)).size:
             parts.append(check_stamps(name, table[:, 0] * 1e-9, "ns", gaps=gaps))
-    log = truth = None
+    log = None
     try:
         if (mav0 / "imu0").is_dir():
             log = euroc.load_imu(path)
             parts.append(_readings(log))
         else:
             parts.append(Checked(notes=("no imu0: poses are not tested against readings",)))
-        if (mav0 / "state_groundtruth_estimate0").is_dir() and log is not None:
-            truth = euroc.load_truth(path)
-            parts.append(_truth(mav0, log, truth))
+        file = next((f for name in _TRUTHS if (f := mav0 / name / "data.csv").is_file()), None)
+        if file is not None and log is not None:
+            trajectory = io.read_euroc(file, first_of_equal=True)
+            t, T = trajectory.t - 1e-9 * log.t0_ns, trajectory.T
+            parts += [_truth(file, log, t, T), check_imu(log.imu, t, T, log.T_body_imu[:3, :3])]
         else:
-            parts.append(
-                Checked(notes=("no state_groundtruth_estimate0: there is no truth to compare with",))
-            )
+            parts.append(Checked(notes=(f"no {' or '.join(_TRUTHS)}: there is no truth to compare with",)))
     except (DataError, OSError) as error:
         parts.append(unusable(error))
-    if log is not None and truth is not None:
-        parts.append(check_imu(log.imu, truth.t, truth.T_world_body, log.T_body_imu[:3, :3]))
-    if log is None and not parts[0].facts:
+    if not any(part.facts for part in parts):
         raise DataError(f"{mav0}: expected imu0/data.csv, cam0/data.csv or both, got neither")
     return join(parts)
 
@@ -64,15 +65,18 @@ def _readings(log: euroc.ImuLog) -> Checked:
     return Checked((Fact("readings", text, {"omega": rate, "acceleration": force}),))
 
 
-def _truth(mav0: Path, log: euroc.ImuLog, truth: euroc.Truth) -> Checked:
+def _truth(
+    file: Path, log: euroc.ImuLog, t: Float[np.ndarray, " n"], T: Float[np.ndarray, "n 4 4"]
+) -> Checked:
+    """How much of the readings has truth, and the truth by itself; `t` is by the clock of the readings."""
     end = float(np.asarray(log.imu.t)[-1])
-    shared = max(0.0, min(end, truth.t[-1]) - max(0.0, truth.t[0]))
-    text = f"from {truth.t[0]:.3g} to {truth.t[-1]:.4g} s, IMU from 0 to {end:.4g} s"
-    fact = Fact("truth", text, {"first_s": float(truth.t[0]), "coverage": shared / end if end else 0.0})
-    findings = []
+    shared = max(0.0, min(end, t[-1]) - max(0.0, t[0]))
+    text = f"from {t[0]:.3g} to {t[-1]:.4g} s, IMU from 0 to {end:.4g} s"
+    fact = Fact("truth", text, {"first_s": float(t[0]), "coverage": shared / end if end else 0.0})
+    findings = ()
     if shared <= 0:
         fix = "check that both are of one recording, by one clock"
-        findings.append(Finding("warning", "truth", text, "truth while the IMU reads", fix))
-    values = read_table(mav0 / "state_groundtruth_estimate0" / "data.csv")[:, 4:8]
-    poses = check_poses(truth.t, truth.T_world_body, Quaternions(values, "wxyz"))
-    return join([Checked((fact,), tuple(findings)), poses])
+        findings = (Finding("warning", "truth", text, "truth while the IMU reads", fix),)
+    table = read_table(file)
+    values = table[np.append(True, np.diff(table[:, 0]) != 0), 4:8]
+    return join([Checked((fact,), findings), check_poses(t, T, Quaternions(values, "wxyz"))])

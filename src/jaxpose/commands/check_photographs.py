@@ -11,6 +11,7 @@ from jaxpose.commands.check_poses import check_poses
 from jaxpose.commands.check_recording import check_camera
 from jaxpose.data import blender, llff
 from jaxpose.data.images import SUFFIXES, image_size
+from jaxpose.data.photographs import OPENGL
 from jaxpose.errors import DataError
 from jaxpose.recording import Photographs
 
@@ -53,9 +54,10 @@ def _look(T: Float[np.ndarray, "n 4 4"]) -> Checked:
     test, expected = "viewing directions", "cameras that look at a common place"
     front, apart = _common_point(T)
     if apart > _MEET:
-        turned_front, turned_apart = _common_point(np.linalg.inv(T))
+        # The loader turned the axes of what it took for camera-to-world: first back to the file's.
+        turned_front, turned_apart = _common_point(np.linalg.inv(T @ OPENGL) @ OPENGL)
         if turned_apart < _MEET and turned_apart < apart / 3:
-            axes = "" if turned_front > 0.5 else " in the other axes (OpenCV, OpenGL)"
+            axes = "" if turned_front > 0.5 else ", in OpenCV axes"
             found = f"optical axes that do not meet, but do with world-to-camera poses{axes}"
             return Checked((), (Finding("warning", test, found, expected, "invert the poses"),))
         return Checked(notes=("the optical axes meet nowhere: the poses' convention is not tested",))

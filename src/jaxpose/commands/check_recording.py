@@ -33,8 +33,9 @@ def check_recording(path: Path, form: recordings.Format) -> Checked:
         parts.append(check_inertial(path))
     try:
         recording = recordings.load(path, form)
-        parts += [_frames(recording), check_camera(recording.camera), _depth(recording)]
-        parts += [_truth(recording), check_reprojection(recording), Checked(notes=recording.notes)]
+        parts += [Checked(notes=recording.notes), _frames(recording), check_camera(recording.camera)]
+        for test in (_depth, _truth, check_reprojection):
+            parts.append(test(recording))
     except (DataError, OSError) as error:
         parts.append(unusable(error))
     return join(parts)
@@ -82,6 +83,9 @@ def _depth(recording: Recording) -> Checked:
     rows = sorted({round(row) for row in np.linspace(0, len(recording.t) - 1, _LOOKED_AT)})
     depth = np.stack([recording.read(row).depth for row in rows])
     valid = depth[depth > 0]
+    if not valid.size:
+        found = f"none in {len(rows)} frames"
+        return Checked((), (Finding("warning", "depth", found, "depth in metres", "check its scale"),))
     covered = valid.size / depth.size
     near, middle, far = (float(x) for x in np.quantile(valid, [0.01, 0.5, 0.99]))
     text = f"{covered:.0%} of the pixels, 98% of it from {near:.3g} to {far:.3g} m, median {middle:.3g} m "
