@@ -13,6 +13,7 @@ from jaxpose.commands.check_poses import Quaternions, check_poses
 from jaxpose.commands.check_stamps import check_stamps, read_table
 from jaxpose.data import euroc
 from jaxpose.data.euroc_files import sensors
+from jaxpose.data.images import found
 from jaxpose.errors import DataError
 
 _TRUTHS = ("state_groundtruth_estimate0", "mocap0")  # of EuRoC, of TUM-VI
@@ -49,12 +50,12 @@ def check_inertial(path: Path) -> Checked:
             trajectory = io.read_euroc(file, first_of_equal=True)
             t, T = trajectory.t - 1e-9 * log.t0_ns, trajectory.T
             parts += [_truth(file, log, t, T), check_imu(log.imu, t, T, log.T_body_imu[:3, :3])]
-        else:
+        elif file is None:
             parts.append(Checked(notes=(f"no {' or '.join(_TRUTHS)}: there is no truth to compare with",)))
     except (DataError, OSError) as error:
         parts.append(unusable(error))
-    if not any(part.facts for part in parts):
-        raise DataError(f"{mav0}: expected imu0/data.csv, cam0/data.csv or both, got neither")
+    if not any(part.facts or part.findings for part in parts):
+        raise DataError(f"{mav0}: expected imu0, cam0 or both, got {found(mav0)}")
     return join(parts)
 
 
@@ -71,7 +72,7 @@ def _truth(
     """How much of the readings has truth, and the truth by itself; `t` is by the clock of the readings."""
     end = float(np.asarray(log.imu.t)[-1])
     shared = max(0.0, min(end, t[-1]) - max(0.0, t[0]))
-    text = f"from {t[0]:.3g} to {t[-1]:.4g} s, IMU from 0 to {end:.4g} s"
+    text = f"from {t[0]:.3f} to {t[-1]:.3f} s, IMU from 0 to {end:.3f} s"
     fact = Fact("truth", text, {"first_s": float(t[0]), "coverage": shared / end if end else 0.0})
     findings = ()
     if shared <= 0:

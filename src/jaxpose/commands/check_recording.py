@@ -33,7 +33,11 @@ def check_recording(path: Path, form: recordings.Format) -> Checked:
         parts.append(check_inertial(path))
     try:
         recording = recordings.load(path, form)
-        parts += [Checked(notes=recording.notes), _frames(recording), check_camera(recording.camera)]
+        parts += [
+            Checked(notes=recording.notes),
+            _frames(recording, _stamped(path, form)),
+            check_camera(recording.camera),
+        ]
         for test in (_depth, _truth, check_reprojection):
             parts.append(test(recording))
     except (DataError, OSError) as error:
@@ -65,7 +69,15 @@ def check_camera(camera: Camera) -> Checked:
     return Checked((Fact("camera", text, numbers),), (finding,))
 
 
-def _frames(recording: Recording) -> Checked:
+def _stamped(path: Path, form: recordings.Format) -> bool:
+    """Whether the frames have stamps of their own."""
+    if form != "plain":
+        return form in ("tum", "euroc")
+    poses = path / "poses.txt"
+    return (path / "times.txt").is_file() or (poses.is_file() and read_table(poses).shape[1] == 8)
+
+
+def _frames(recording: Recording, stamped: bool) -> Checked:
     t = recording.t
     steps = np.diff(t)
     period = float(np.median(steps)) if len(steps) else np.nan
@@ -73,8 +85,9 @@ def _frames(recording: Recording) -> Checked:
     numbers: dict[str, float | str] = {"count": len(t)}
     if len(steps):
         text += f" at {1 / period:.4g} Hz over {t[-1]:.4g} s, largest gap {steps.max():.3g} s"
-        text += f" at {t[steps.argmax()]:.4g} s"
+        text += f" at {t[steps.argmax()]:.4g} s" + ("" if stamped else "; no stamps, so the rate is assumed")
         numbers |= {"rate_hz": 1 / period, "span_s": float(t[-1]), "largest_gap_s": float(steps.max())}
+        numbers |= {"largest_gap_at_s": float(t[steps.argmax()]), "stamped": stamped}
     return Checked((Fact("frames", text, numbers),))
 
 

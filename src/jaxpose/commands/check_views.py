@@ -63,8 +63,8 @@ def agreement(
     Of all that have depth, and of those that land on depth. Depth is multiplied by `scales`.
     """
     points, valid, there = views.points[pair], views.valid[pair], views.there[pair]
-    moved = np.einsum("s,skm,nm->snk", scales, T_second_first[:, :3, :3], points)
-    moved += T_second_first[:, None, :3, 3]
+    R_first_second = np.swapaxes(T_second_first[:, :3, :3], 1, 2)
+    moved = scales[:, None, None] * (points @ R_first_second) + T_second_first[:, None, :3, 3]
     row, column, inside = _nearest_pixel(views.project(moved), there)
     met = there[row, column] * scales[:, None]
     seen = inside & valid & (met > 0)
