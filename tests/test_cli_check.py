@@ -3,7 +3,7 @@
 import json
 import os
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -242,7 +242,9 @@ def write_csv(file, t, rows, ns):
 def test_a_good_imu_has_no_fault(tmp_path):
     result = checked(euroc(tmp_path))
     assert result.format.startswith("EuRoC") and faults(result) == ""
-    (numbers,) = [fact.numbers for fact in result.facts if fact.name == "IMU and poses"]
+    numbers: dict[str, Any] = {
+        k: v for f in result.facts if f.name == "IMU and poses" for k, v in f.numbers.items()
+    }
     assert numbers["correlation"] > 0.999 and abs(numbers["offset_s"]) < 1e-3
     assert numbers["rotation_deg"] < 0.5 and numbers["gyro_ratio"] == pytest.approx(1, abs=0.01)
     assert numbers["gyro_bias"] == pytest.approx(np.linalg.norm([0.01, -0.02, 0.05]), abs=5e-3)
