@@ -132,9 +132,10 @@ def test_a_good_recording_has_no_fault(tmp_path, clip, save):
         ({"change": lambda T: FLIP @ np.linalg.inv(T)}, "world-to-camera poses, OpenGL axes"),
         (
             {"per_metre": 5000.0},
-            "depth scale 5000 for 1000 (or 5 times too large); multiply the depth by 0.2",
+            "depth scale 5000 for 1000 (depth is 5 times too large); multiply the depth by 0.2",
         ),
-        ({"per_metre": 200.0}, "multiply the depth by 5"),
+        ({"per_metre": 200.0}, "5 times too small; multiply the depth by 5"),
+        ({"per_metre": 1310.7}, "depth scale 6553.5 for 5000; multiply the depth by 0.763"),
         (
             {"per_metre": 5000.0, "change": inverted},
             "world-to-camera poses, OpenCV axes and depth scale 5000",
@@ -154,7 +155,7 @@ def test_poses_of_other_frames_fit_no_convention(tmp_path, clip, save):
     T = np.tile(np.eye(4), (len(clip.t), 1, 1))
     T[:, :3, :3], T[:, :3, 3] = turned, generator.normal(size=(len(clip.t), 3))
     result = checked(plain(tmp_path, clip, save, change=lambda _: T))
-    assert "not more under any convention" in faults(result)
+    assert "no other convention fits" in faults(result)
 
 
 def test_tum_in_its_own_conventions_and_in_others(tmp_path, clip, save):

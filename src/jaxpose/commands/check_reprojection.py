@@ -26,10 +26,11 @@ _CONVENTIONS = {
 }
 _PER_METRE = (1000.0, 5000.0, 6553.5)  # of 7-Scenes and most others, of TUM, of Replica
 _SCALES = np.array(sorted({a / b for a in _PER_METRE for b in _PER_METRE} | {1e-3, 1e3}))
-_TOLERANCE = 0.03  # of the depth
+_TOLERANCE = 0.02  # of the depth
 _BETTER, _TIMES = 0.04, 1.1  # by how much, and how many times, more points have to agree
-_FEW = 0.15  # of the points that land in the other image; nothing fits
+_FEW = 0.2  # of the points that land in the other image; nothing fits
 _SAME = 0.03  # shares this near are not told apart
+_LEAST_PAIRS = 4  # of frames that agree better
 
 _LEAST_HZ = 10.0  # of the frames, so that poses between them can be had
 _OFFSETS_S = np.arange(-20, 21) * 0.01
@@ -48,7 +49,8 @@ def check_reprojection(recording: Recording) -> Checked:
     names, given = tuple(_CONVENTIONS), (0, int(np.flatnonzero(_SCALES == 1)[0]))
     best = tuple(int(k) for k in np.unravel_index(share.argmax(), share.shape))
     wins, loses = (of_all[:, *best] > of_all[:, *given]).sum(), (of_all[:, *best] < of_all[:, *given]).sum()
-    if share[best] > max(share[given] + _BETTER, _TIMES * share[given]) and wins > 2 * loses:
+    more = share[best] > max(share[given] + _BETTER, _TIMES * share[given])
+    if more and wins >= max(_LEAST_PAIRS, 2 * loses) and in_view.mean(0)[best] >= _FEW:
         scale = float(_SCALES[best[1]])
         words, mend = [], []
         if best[0] != given[0]:
@@ -61,7 +63,7 @@ def check_reprojection(recording: Recording) -> Checked:
         return Checked((), (Finding("warning", test, found, expected, " and ".join(mend)),))
     if in_view.mean(0)[given] < _FEW:
         found = f"{in_view.mean(0)[given]:.0%} of the depth in the other image's view agreeing, {told}, and "
-        found += "not more under any convention that was tried"
+        found += "no other convention fits"
         fix = "check that poses belong to these frames, depth to this colour camera, and the intrinsics"
         return Checked((), (Finding("warning", test, found, "poses that carry depth onto depth", fix),))
     others = np.delete(share, given[0], axis=0).max(1)
@@ -80,7 +82,8 @@ def _scale(scale: float) -> str:
     if scale in (1e3, 1e-3):
         return f"depth {'1/1000' if scale > 1 else '1000'} of the poses' unit"
     read, meant = next((a, b) for a in _PER_METRE for b in _PER_METRE if a / b == scale)
-    return f"depth scale {meant:g} for {read:g} (or {1 / scale:.4g} times too large)"
+    size = f"{1 / scale:.4g} times too large" if scale < 1 else f"{scale:.4g} times too small"
+    return f"depth scale {meant:g} for {read:g} (depth is {size})"
 
 
 def _scores(views: Views, T_given: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
