@@ -15,7 +15,7 @@ from jaxpose.data.photographs import OPENGL
 from jaxpose.errors import DataError
 from jaxpose.recording import Photographs
 
-_WIDTH = 16  # pixels: the images are decoded to see that they can be, and not kept
+_WIDTH = 8  # pixels: the images are decoded to see that they can be, and not kept
 _PARALLEL = 1e-2  # least share of the directions across the axes; less has no point in common
 _MEET = 0.3  # distance of an axis from the common point, over the distance to it
 
