@@ -13,7 +13,6 @@ LAYERS = (
 ).split()
 BESIDE = {
     "ekf": "imu",
-    "ekf_steps": "imu",
     "__main__": "cli",
 }  # modules named unlike their layer; imu_simulation is plainly imu's
 PACKAGE = Path(jaxpose.__file__).parent

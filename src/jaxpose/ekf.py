@@ -1,190 +1,200 @@
-"""Error-state Kalman filter and smoother: gyroscope, accelerometer and poses (METHOD section 5).
+"""Error-state Kalman filter and smoother of IMU readings and poses (METHOD section 5), pure and traceable.
 
 The readings drive the prediction, poses correct it (a multiplicative filter, after Sola, "Quaternion
-kinematics for the error-state Kalman filter", 2017). The steps themselves are in `ekf_steps`.
+kinematics for the error-state Kalman filter", 2017). The error has 15 components: position and velocity
+[m, m/s, world], rotation [rad, right increment], bias of the gyroscope [rad/s] and the accelerometer [m/s^2].
+`imu_filter.filter_imu` is the way in for recordings.
 """
 
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Float
-from scipy.spatial.transform import Rotation
+from jaxtyping import Array, Bool, Float
 
-from jaxpose.ekf_steps import PoseNoise, State, Step, backward, forward
-from jaxpose.errors import DataError
-from jaxpose.imu import GRAVITY_WORLD, Gravity, Imu, ImuNoise
+from jaxpose import se3
+from jaxpose.imu import ImuNoise
 
 
-class Prior(NamedTuple):
-    """One standard deviation, per axis, of what the first pose does not tell; the biases' mean is zero."""
+class PoseNoise(NamedTuple):
+    """One standard deviation of a measured pose, per axis; errors are independent from pose to pose."""
 
-    velocity: float = 1.0  # m/s, about the difference of the first poses
-    gyro_bias: float = 0.1  # rad/s
-    accelerometer_bias: float = 0.5  # m/s^2
-
-
-DEFAULT_PRIOR = Prior()
+    position: float  # m
+    rotation: float  # rad
 
 
-class Filtered(NamedTuple):
-    """The body's motion at every IMU stamp, SI units; rows before the first pose are NaN.
+class State(NamedTuple):
+    """What the filter knows the mean of."""
 
-    Readings are free of bias, the acceleration of gravity too. Innovations are [translation (world), rotation
-    (body)] of the measured pose against the predicted one, NaN where there was no pose.
-    """
-
-    t: Float[np.ndarray, " n"]
-    T_world_body: Float[np.ndarray, "n 4 4"]
-    velocity_world: Float[np.ndarray, "n 3"]
-    omega_body: Float[np.ndarray, "n 3"]
-    acceleration_body: Float[np.ndarray, "n 3"]
-    acceleration_world: Float[np.ndarray, "n 3"]
-    gyro_bias: Float[np.ndarray, "n 3"]
-    accelerometer_bias: Float[np.ndarray, "n 3"]
-    covariance: Float[np.ndarray, "n 15 15"]  # of the error
-    innovation: Float[np.ndarray, "n 6"]
-    innovation_covariance: Float[np.ndarray, "n 6 6"]
-    nis: Float[np.ndarray, " n"]  # normalised innovation squared, chi-square of 6 dof if all is as stated
-    log_likelihood: float  # of the poses after the first
-    poses_used: int
-    poses_skipped: int  # not finite, beyond the readings, or not the nearest to any stamp
+    T_world_body: Float[Array, "*n 4 4"]
+    velocity_world: Float[Array, "*n 3"]
+    gyro_bias: Float[Array, "*n 3"]
+    accelerometer_bias: Float[Array, "*n 3"]
 
 
-def filter_imu(
-    imu: Imu,
-    t_pose: Float[np.ndarray, " m"],
-    T_world_body: Float[np.ndarray, "m 4 4"],
+class Step(NamedTuple):
+    """From one reading to the next, and the pose measured `late` seconds after the latter (or before it)."""
+
+    dt: Float[Array, "*n"]
+    omega_body: Float[Array, "*n 2 3"]  # readings at both ends
+    acceleration_body: Float[Array, "*n 2 3"]
+    T_world_body: Float[Array, "*n 4 4"]  # finite, but any where none was measured
+    late: Float[Array, "*n"]
+    measured: Bool[Array, "*n"]
+
+
+class Passed(NamedTuple):
+    """What each step leaves behind, for the smoother and for the user."""
+
+    predicted: State
+    predicted_covariance: Float[Array, "*n 15 15"]
+    transition: Float[Array, "*n 15 15"]
+    state: State
+    covariance: Float[Array, "*n 15 15"]
+    innovation: Float[Array, "*n 6"]  # of the measured pose against the predicted: world [m], body [rad]
+    innovation_covariance: Float[Array, "*n 6 6"]
+    nis: Float[Array, "*n"]  # innovation squared over its covariance
+
+
+def retract(state: State, error: Float[Array, "15"]) -> State:
+    """The state that is `error` away."""
+    position, velocity, rotation, gyro_bias, accelerometer_bias = jnp.split(error, 5)
+    T = state.T_world_body
+    return State(
+        se3.make(_product(T[:3, :3], se3.so3_exp(rotation)), T[:3, 3] + position),
+        state.velocity_world + velocity,
+        state.gyro_bias + gyro_bias,
+        state.accelerometer_bias + accelerometer_bias,
+    )
+
+
+def difference(a: State, b: State) -> Float[Array, "15"]:
+    """The error that takes a to b: `retract(a, difference(a, b)) = b`."""
+    T_a, T_b = a.T_world_body, b.T_world_body
+    return jnp.concatenate(
+        [
+            T_b[:3, 3] - T_a[:3, 3],
+            b.velocity_world - a.velocity_world,
+            se3.so3_log(_product(T_a[:3, :3].T, T_b[:3, :3])),
+            b.gyro_bias - a.gyro_bias,
+            b.accelerometer_bias - a.accelerometer_bias,
+        ]
+    )
+
+
+def propagate(
+    state: State,
+    dt: Float[Array, ""],
+    omega_body: Float[Array, "2 3"],
+    acceleration_body: Float[Array, "2 3"],
+    gravity_world: Float[Array, "3"],
+) -> State:
+    """The state `dt` later from the readings at both ends (trapezoidal rule; biases stay)."""
+    T = state.T_world_body
+    turn = se3.so3_exp((omega_body.mean(axis=0) - state.gyro_bias) * dt)
+    R_world_next = _product(T[:3, :3], turn)
+    force = acceleration_body - state.accelerometer_bias[None]
+    acceleration = (_product(T[:3, :3], force[0]) + _product(R_world_next, force[1])) / 2 + gravity_world
+    position = T[:3, 3] + (state.velocity_world + acceleration * dt / 2) * dt
+    return state._replace(
+        T_world_body=se3.make(R_world_next, position), velocity_world=state.velocity_world + acceleration * dt
+    )
+
+
+def transition(
+    state: State,
+    dt: Float[Array, ""],
+    omega_body: Float[Array, "2 3"],
+    acceleration_body: Float[Array, "2 3"],
+    gravity_world: Float[Array, "3"],
+) -> tuple[State, Float[Array, "15 15"]]:
+    """`propagate`, and the matrix by which a small error of the state goes on."""
+    ahead = lambda start: propagate(start, dt, omega_body, acceleration_body, gravity_world)
+    after = ahead(state)
+    grow = lambda error: difference(after, ahead(retract(state, error)))
+    return after, jax.jacfwd(grow)(jnp.zeros(15, dt.dtype))
+
+
+def _predict(state, covariance, step: Step, noise: ImuNoise, gravity_world):
+    after, F = transition(state, step.dt, step.omega_body, step.acceleration_body, gravity_world)
+    # White noise of a reading acts as a bias would that lasts for this step only.
+    G = (F - jnp.eye(15, dtype=F.dtype))[:, 9:]
+    white = jnp.repeat(jnp.stack([noise.gyro_density, noise.accelerometer_density]) ** 2 / step.dt, 3)
+    walk = jnp.repeat(jnp.stack([noise.gyro_walk, noise.accelerometer_walk]) ** 2 * step.dt, 3)
+    drift = jnp.diag(jnp.concatenate([jnp.zeros(9, walk.dtype), walk]))
+    return after, _sandwich(F, covariance) + _sandwich(G, jnp.diag(white)) + drift, F
+
+
+def _correct(state, covariance, step: Step, pose_noise: PoseNoise):
+    def rest(error):
+        """The measured pose against that of the state, carried to the pose's own time by its own motion."""
+        at = retract(state, error)
+        turn = se3.so3_exp((step.omega_body[1] - at.gyro_bias) * step.late)
+        R_world_body = _product(at.T_world_body[:3, :3], turn)
+        position = at.T_world_body[:3, 3] + at.velocity_world * step.late
+        rotation = se3.so3_log(_product(R_world_body.T, step.T_world_body[:3, :3]))
+        return jnp.concatenate([step.T_world_body[:3, 3] - position, rotation])
+
+    zero = jnp.zeros(15, covariance.dtype)
+    innovation, H = rest(zero), -jax.jacfwd(rest)(zero)
+    N = jnp.diag(jnp.repeat(jnp.stack([pose_noise.position, pose_noise.rotation]) ** 2, 3))
+    S = _sandwich(H, covariance) + N
+    solved = jnp.linalg.solve(S, jnp.concatenate([_product(H, covariance), innovation[:, None]], axis=1))
+    K = jnp.where(step.measured, solved[:, :15].T, 0)
+    # Joseph's form stays positive whatever rounding does to K.
+    covariance = _sandwich(jnp.eye(15, dtype=K.dtype) - _product(K, H), covariance) + _sandwich(K, N)
+    return retract(state, _product(K, innovation)), covariance, innovation, S, innovation @ solved[:, 15]
+
+
+@jax.jit
+def forward(
+    start: State,
+    covariance: Float[Array, "15 15"],
+    steps: Step,
     noise: ImuNoise,
     pose_noise: PoseNoise,
-    *,
-    prior: Prior = DEFAULT_PRIOR,
-    smooth: bool = False,
-    gravity_world: Gravity = GRAVITY_WORLD,
-) -> Filtered:
-    """Fuse readings with poses of the same body (m, on the same clock), in JAX's default precision.
+    gravity_world: Float[Array, "3"],
+) -> Passed:
+    """The filter over all `steps` from the `start` and its covariance; noise as scalar arrays."""
 
-    A pose corrects the state at the reading nearest to it, which is carried to the pose's own time by its own
-    velocity and rate: nothing is interpolated. `smooth` lets later poses speak for earlier states too; the
-    innovations stay those of the forward pass. Poses with NaN are left out. DataError for stamps that do not
-    rise, readings that are not finite, or fewer than two poses within the readings; ValueError for sigmas.
-    """
-    if not all(np.isfinite(noise)) or min(noise) < 0 or min(pose_noise) <= 0 or min(prior) <= 0:
-        raise ValueError(
-            f"expected noise of at least 0 and sigmas above 0, got {noise}, {pose_noise}, {prior}"
-        )
-    t = _readings_checked(imu, t_pose)
-    late, row = _nearest_poses(t, np.asarray(t_pose, np.float64), T_world_body)
-    used = np.flatnonzero(row >= 0)
-    if len(used) < 2:
-        raise DataError(
-            f"poses: expected at least 2 finite ones within the readings ({t[0]:.3f} to {t[-1]:.3f} s),"
-            f" got {len(used)} of {len(t_pose)}"
-        )
-    first = used[0]
-    pairs = lambda values: jnp.asarray(np.stack([values[first:-1], values[first + 1 :]], axis=1))
-    measured = row[first + 1 :] >= 0
-    # The row of a step without a pose must be finite: what is masked out would still turn gradients into NaN.
-    poses = np.where(measured[:, None, None], np.asarray(T_world_body)[row[first + 1 :]], np.eye(4))
-    steps = Step(
-        dt=jnp.asarray(np.diff(t[first:])),
-        omega_body=pairs(np.asarray(imu.omega_body)),
-        acceleration_body=pairs(np.asarray(imu.acceleration_body)),
-        T_world_body=jnp.asarray(poses),
-        late=jnp.asarray(late[first + 1 :]),
-        measured=jnp.asarray(measured),
+    def step(carry: tuple[State, Float[Array, "15 15"]], step: Step):
+        predicted, P, F = _predict(*carry, step, noise, gravity_world)
+        state, covariance, innovation, S, nis = _correct(predicted, P, step, pose_noise)
+        passed = Passed(predicted, P, F, state, covariance, innovation, S, nis)
+        return (state, covariance), passed
+
+    return jax.lax.scan(step, (start, covariance), steps)[1]
+
+
+@jax.jit
+def backward(
+    start: State, covariance: Float[Array, "15 15"], passed: Passed
+) -> tuple[State, Float[Array, "n 15 15"]]:
+    """States and covariances given later poses too, the `start` first (Rauch, Tung and Striebel)."""
+    last = jax.tree.map(lambda x: x[-1], (passed.state, passed.covariance))
+    before = jax.tree.map(
+        lambda first, x: jnp.concatenate([first[None], x[:-1]]),
+        (start, covariance),
+        (passed.state, passed.covariance),
     )
-    sigmas = [
-        pose_noise.position,
-        prior.velocity,
-        pose_noise.rotation,
-        prior.gyro_bias,
-        prior.accelerometer_bias,
-    ]
-    covariance = jnp.asarray(np.diag(np.repeat(sigmas, 3).astype(np.float64) ** 2))
-    start = _start(t, imu, late, row, used, t_pose, T_world_body)
-    gravity = jnp.asarray(gravity_world, covariance.dtype)
-    settings = jax.tree.map(lambda x: jnp.asarray(x, covariance.dtype), (noise, pose_noise))
-    passed = forward(start, covariance, steps, *settings, gravity)
-    if smooth:
-        states = backward(start, covariance, passed)
-    else:
-        begin = lambda a, rest: jnp.concatenate([a[None], rest])
-        states = jax.tree.map(begin, (start, covariance), (passed.state, passed.covariance))
-    return _output(imu, t, first, states, passed, measured, len(used), len(t_pose), gravity_world, smooth)
+
+    def step(later, row):
+        (state, P), predicted, predicted_P, F = row
+        C = jnp.linalg.solve(predicted_P, _product(F, P)).T
+        state = retract(state, _product(C, difference(predicted, later[0])))
+        smoothed = state, P + _sandwich(C, later[1] - predicted_P)
+        return smoothed, smoothed
+
+    rows = before, passed.predicted, passed.predicted_covariance, passed.transition
+    _, smoothed = jax.lax.scan(step, last, rows, reverse=True)
+    return jax.tree.map(lambda x, end: jnp.concatenate([x, end[None]]), smoothed, last)
 
 
-def _readings_checked(imu: Imu, t_pose: Float[np.ndarray, " m"]) -> Float[np.ndarray, " n"]:
-    """The stamps of readings that can be used."""
-    t = np.asarray(imu.t, np.float64)
-    for name, stamps in (("IMU", t), ("poses", np.asarray(t_pose, np.float64))):
-        rise = np.diff(stamps) > 0
-        if not rise.all():
-            row = int(np.argmin(rise)) + 1
-            raise DataError(f"{name}: expected rising stamps, got {stamps[row]} after {stamps[row - 1]} s")
-    finite = np.isfinite(np.concatenate([imu.omega_body, imu.acceleration_body], axis=1)).all(axis=1)
-    if len(t) < 2 or not finite.all():
-        found = f"{len(t)}" if len(t) < 2 else f"NaN or infinity in row {int(np.argmin(finite))}"
-        raise DataError(f"IMU: expected at least 2 finite readings, got {found}")
-    return t
+def _product(a: Float[Array, "..."], b: Float[Array, "..."]) -> Float[Array, "..."]:
+    return jnp.matmul(a, b, precision="highest")
 
 
-def _nearest_poses(t: Float[np.ndarray, " n"], t_pose: Float[np.ndarray, " m"], poses):
-    """For each reading how late its pose comes [s], and the pose's row, -1 where there is none."""
-    near = np.searchsorted((t[1:] + t[:-1]) / 2, t_pose)
-    late = t_pose - t[near]
-    usable = np.isfinite(poses).all(axis=(1, 2)) & (np.abs(late) <= np.median(np.diff(t)))
-    row, wait = np.full(len(t), -1), np.zeros(len(t))
-    for i in sorted(np.flatnonzero(usable), key=lambda i: -abs(late[i])):  # the nearest comes last and stays
-        row[near[i]], wait[near[i]] = i, late[i]
-    return wait, row
-
-
-def _start(t, imu: Imu, late, row, used, t_pose, poses) -> State:
-    """The first pose, with the mean velocity to the pose a tenth of a second on, carried to the reading."""
-    first = used[0]
-    ahead = used[min(max(1, np.searchsorted(t[used], t[first] + 0.1)), len(used) - 1)]
-    a, b = row[first], row[ahead]
-    velocity = (poses[b, :3, 3] - poses[a, :3, 3]) / (t_pose[b] - t_pose[a])
-    T = np.array(poses[a], np.float64)
-    T[:3, 3] -= velocity * late[first]
-    T[:3, :3] = T[:3, :3] @ Rotation.from_rotvec(-np.asarray(imu.omega_body)[first] * late[first]).as_matrix()
-    return State(*(jnp.asarray(x) for x in (T, velocity, np.zeros(3), np.zeros(3))))
-
-
-def _output(imu, t, first, states, passed, measured, used, given, gravity_world, smooth) -> Filtered:
-    """Everything as numpy, one row per reading."""
-    (state, covariance), passed = jax.tree.map(np.asarray, (states, passed))
-
-    def rows(values, valid=None):
-        full = np.full((len(t), *values.shape[1:]), np.nan, values.dtype)
-        full[len(t) - len(values) :] = values
-        if valid is not None:
-            full[len(t) - len(values) :][~valid] = np.nan
-        return full
-
-    R = state.T_world_body[:, :3, :3]
-    force = np.asarray(imu.acceleration_body)[first:] - state.accelerometer_bias
-    acceleration = np.einsum("nij,nj->ni", R, force) + np.asarray(gravity_world)
-    if smooth:  # what the poses say of the noise of the readings is in the velocity already
-        acceleration = np.gradient(state.velocity_world, t[first:], axis=0)
-    S, nis = passed.innovation_covariance[measured], passed.nis[measured]
-    log_likelihood = -(nis + np.linalg.slogdet(2 * np.pi * S)[1]).sum() / 2
-    return Filtered(
-        t=t,
-        T_world_body=rows(state.T_world_body),
-        velocity_world=rows(state.velocity_world),
-        omega_body=rows(np.asarray(imu.omega_body)[first:] - state.gyro_bias),
-        acceleration_body=rows(np.einsum("nji,nj->ni", R, acceleration)),
-        acceleration_world=rows(acceleration),
-        gyro_bias=rows(state.gyro_bias),
-        accelerometer_bias=rows(state.accelerometer_bias),
-        covariance=rows(covariance),
-        innovation=rows(passed.innovation, measured),
-        innovation_covariance=rows(passed.innovation_covariance, measured),
-        nis=rows(passed.nis, measured),
-        log_likelihood=float(log_likelihood),
-        poses_used=used,
-        poses_skipped=given - used,
-    )
+def _sandwich(A: Float[Array, "i k"], P: Float[Array, "k k"]) -> Float[Array, "i i"]:
+    """A P A^T, symmetric to the last bit."""
+    full = _product(_product(A, P), A.T)
+    return (full + full.T) / 2
