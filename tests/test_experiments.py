@@ -161,6 +161,7 @@ def test_compare_runs_every_mode(finished, tmp_path, monkeypatch, recording):
     monkeypatch.setattr(slam_run, "inertial", lambda *args: None)
     monkeypatch.setattr(slam_run, "_draw", lambda *args: None)
     monkeypatch.setattr(slam_run, "_write_surface", lambda *args: ())
+    monkeypatch.setattr(slam_run, "renderer", lambda *args: None)
     monkeypatch.setattr(slam_run, "map_quality", lambda *args: {"mapped": None, "held_out": None})
     outcome = imu_slam.run(imu_slam.Config(smoke=True, compare=True, out=tmp_path / "all"))
     assert modes == ["none", "loose", "tight", "accelerometer", "combined"]

@@ -5,7 +5,7 @@ import json
 import math
 import os
 import platform
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
@@ -69,7 +69,7 @@ def read_kitti(path: Path | str, *, rate_hz: float = 10.0) -> Trajectory:
     lines, values = read_numbers(path, _KITTI_COLUMNS, counts=(12,))
     T = np.tile(np.eye(4), (len(values), 1, 1))
     T[:, :3] = values.reshape(-1, 3, 4)
-    return Trajectory(np.arange(len(T)) / rate_hz, orthonormal(path, lines, T))
+    return Trajectory(np.arange(len(T)) / rate_hz, orthonormal(T, lambda i: f"{path}:{lines[i]}"))
 
 
 def write_kitti(path: Path | str, T_world_cam: Float[np.ndarray, "n 4 4"]) -> None:
@@ -107,16 +107,16 @@ def write_euroc(path: Path | str, trajectory: Trajectory) -> None:
     write_text(path, f"#timestamp [ns],{','.join(_EUROC_NAMES)}\n" + "".join(lines))
 
 
-def orthonormal(path: Path, lines: list[int], T: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 4 4"]:
+def orthonormal(T: Float[np.ndarray, "n 4 4"], where: Callable[[int], str]) -> Float[np.ndarray, "n 4 4"]:
     """The poses with rotations orthonormal to the last digit.
 
-    DataError naming the line of the worst if it is more than rounding off a rotation.
+    DataError with `where(i)` for the worst, pose i, if it is more than rounding off a rotation.
     """
     rotation = nearest_rotation(T[:, :3, :3])
     off = np.abs(T[:, :3, :3] - rotation).max(axis=(1, 2))
     if off.max() > _MOST_OFF_ROTATION:
         raise DataError(
-            f"{path}:{lines[off.argmax()]}: expected a rotation, got a matrix {off.max():.2g} off one"
+            f"{where(int(off.argmax()))}: expected a rotation, got a matrix {off.max():.2g} off one"
         )
     T = T.copy()
     T[:, :3, :3] = rotation

@@ -90,7 +90,7 @@ def _read_matrices(path: Path, columns: int) -> Trajectory:
         raise DataError(
             f"{path}:{first_lines[off.argmax()]}: expected a last row 0 0 0 1 of the pose, got {found}"
         )
-    return Trajectory(np.arange(len(T)) / 1.0, io.orthonormal(path, first_lines, T))
+    return Trajectory(np.arange(float(len(T))), io.orthonormal(T, lambda i: f"{path}:{first_lines[i]}"))
 
 
 def _lines(path: Path) -> list[tuple[int, str]]:

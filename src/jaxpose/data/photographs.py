@@ -12,10 +12,9 @@ from jaxpose import camera
 from jaxpose.camera import Camera
 from jaxpose.data.images import image_size, open_image
 from jaxpose.errors import DataError
-from jaxpose.metrics import nearest_rotation
+from jaxpose.io import orthonormal
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # right, up, back to right, down, forward, and the other way
-_MOST_OFF_ROTATION = 1e-2  # entries of a rotation matrix; more is not rounding
 
 
 def read_images(
@@ -67,15 +66,7 @@ def check_poses(
     finite = np.isfinite(T_world_cam).all((1, 2))
     if not finite.all():
         raise DataError(f"{where(int(finite.argmin()))}: expected a finite pose, got NaN or infinity")
-    rotation = nearest_rotation(T_world_cam[:, :3, :3])
-    off = np.abs(T_world_cam[:, :3, :3] - rotation).max((1, 2))
-    if off.max() > _MOST_OFF_ROTATION:
-        raise DataError(
-            f"{where(int(off.argmax()))}: expected a rotation, got a matrix {off.max():.2g} off one"
-        )
-    T_world_cam = T_world_cam.copy()
-    T_world_cam[:, :3, :3] = rotation
-    return T_world_cam
+    return orthonormal(T_world_cam, where)
 
 
 def _on_white(image: Image.Image) -> tuple[Image.Image, bool]:

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from jaxpose import metrics
 from jaxpose.plots import View
@@ -27,36 +27,38 @@ PROTOCOL = (
 )
 
 
-class _Rendered(NamedTuple):
+class Rendered(NamedTuple):
     """A frame and the map, at the same pixels."""
 
+    photograph: UInt8[np.ndarray, "height width 3"]  # the whole frame
     frame_rgb: Float[np.ndarray, "h w 3"]  # in [0, 1]
     frame_depth: Float[np.ndarray, "h w"]  # m, 0: none
     rgb: Float[np.ndarray, "h w 3"]
     depth: Float[np.ndarray, "h w"]  # m, 0: nothing there
 
 
-def views(recording: Recording, result: SlamResult) -> list[View]:
+Renderer = Callable[[int], Rendered]
+
+
+def views(recording: Recording, result: SlamResult, render: Renderer) -> list[View]:
     """A few frames, evenly over the recording, beside the map rendered from their estimated poses."""
-    render = _renderer(recording, result)
 
     def view(i: int) -> View:
         seen = render(i)
         lost = ", lost" if result.lost[i] else ""
-        rgb = np.asarray(recording.read(i).rgb)
-        return View(f"t = {recording.t[i]:.2f} s{lost}", rgb, seen.rgb, seen.frame_depth, seen.depth)
+        label = f"t = {recording.t[i]:.2f} s{lost}"
+        return View(label, seen.photograph, seen.rgb, seen.frame_depth, seen.depth)
 
     return [view(i) for i in _evenly(np.arange(len(recording.t)), _VIEWS)]
 
 
-def map_quality(recording: Recording, result: SlamResult) -> dict[str, Any]:
+def map_quality(result: SlamResult, render: Renderer) -> dict[str, Any]:
     """PSNR [dB] and mean depth error [m] of the map at mapped and at held-out frames; None without such."""
-    render = _renderer(recording, result)
     kinds = {"mapped": result.mapped & ~result.lost, "held_out": ~result.mapped & ~result.lost}
     return {"protocol": PROTOCOL} | {kind: _quality(render, chosen) for kind, chosen in kinds.items()}
 
 
-def _quality(render: Callable[[int], _Rendered], chosen: Bool[np.ndarray, " n"]) -> dict[str, Any] | None:
+def _quality(render: Renderer, chosen: Bool[np.ndarray, " n"]) -> dict[str, Any] | None:
     rows = []
     for i in _evenly(np.flatnonzero(chosen), _MEASURED):
         seen = render(i)
@@ -72,7 +74,7 @@ def _quality(render: Callable[[int], _Rendered], chosen: Bool[np.ndarray, " n"])
     return {"psnr": psnr, "depth_l1_m": error, "share_of_depth_shown": share, "frames": len(rows)}
 
 
-def _renderer(recording: Recording, result: SlamResult) -> Callable[[int], _Rendered]:
+def renderer(recording: Recording, result: SlamResult) -> Renderer:
     """The frame with a given index, and the map as seen from its estimated pose.
 
     The measured depth plays no part in the rendering: a first pass over evenly spaced samples finds the
@@ -96,7 +98,7 @@ def _renderer(recording: Recording, result: SlamResult) -> Callable[[int], _Rend
         there = (surface > 0) & (seen.opacity > 0.5)
         return jnp.where(there[:, None], seen.rgb, 0.86), jnp.where(there, seen.depth, 0)
 
-    def at(i: int) -> _Rendered:
+    def at(i: int) -> Rendered:
         frame = recording.read(i)
         image = Image(jnp.asarray(frame.rgb), jnp.asarray(frame.depth, jnp.float32))
         pose = jnp.asarray(result.T_world_cam[i], jnp.float32)
@@ -107,8 +109,10 @@ def _renderer(recording: Recording, result: SlamResult) -> Callable[[int], _Rend
             pixels = read_pixels(image, camera, jnp.asarray(row.flat[chunk]), jnp.asarray(column.flat[chunk]))
             parts.append(jax.device_get(render(result.scene_params, pose, pixels)))
         rgb, depth = (np.concatenate(x)[:count] for x in zip(*parts, strict=True))
-        return _Rendered(
-            np.asarray(frame.rgb)[row, column] / 255,
+        photograph = np.asarray(frame.rgb)
+        return Rendered(
+            photograph,
+            photograph[row, column] / 255,
             np.asarray(frame.depth)[row, column],
             rgb.reshape(*row.shape, 3),
             depth.reshape(row.shape),

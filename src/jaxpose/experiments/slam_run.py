@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from jaxpose import io, plots
 from jaxpose.errors import DataError
-from jaxpose.experiments.slam_map import map_quality, views
+from jaxpose.experiments.slam_map import Renderer, map_quality, renderer, views
 from jaxpose.experiments.slam_measure import Accuracy, Inertial, accuracy, cost, inertial
 from jaxpose.experiments.slam_options import Options, Source, load, slam_config
 from jaxpose.experiments.slam_report import table
@@ -104,6 +104,7 @@ def _single(
     result = track(recording, slam_config(options), None if on_frame is None else partial(on_frame, mode))
     errors = None if truth is None else accuracy(result, recording.t, truth)
     motion = inertial(recording, result)
+    render = renderer(recording, result)
     results = {
         "experiment": experiment,
         "data": source.about,
@@ -120,7 +121,7 @@ def _single(
             "field_gyro_rms_rad_s": motion.gyro_rms,
             "field_accelerometer_rms_m_s2": motion.accelerometer_rms,
         }
-    _draw(folder, f"{recording.name}, IMU {mode}", recording, result, errors, motion)
+    _draw(folder, f"{recording.name}, IMU {mode}", recording, result, render, errors, motion)
     io.write_tum(folder / "trajectory.txt", io.Trajectory(recording.t, result.T_world_cam))
     if truth is not None:
         io.write_tum(folder / "reference.txt", io.Trajectory(recording.t, truth))
@@ -131,7 +132,7 @@ def _single(
     write_camera(folder / "camera.json", recording.camera, recording.files, images_folder)
     io.write_json(folder / "config.json", options)
     results |= {
-        "map": map_quality(recording, result),
+        "map": map_quality(result, render),
         "notes": notes,
         "versions": io.versions(),
         "wall_s": time.perf_counter() - started,
@@ -159,6 +160,7 @@ def _draw(
     name: str,
     recording: Recording,
     result: SlamResult,
+    render: Renderer,
     errors: Accuracy | None,
     motion: Inertial | None,
 ) -> None:
@@ -174,7 +176,9 @@ def _draw(
             folder / "errors.png", recording.t, errors.translation_m, errors.rotation_deg, result.lost, ate
         )
     plots.renders(
-        folder / "renders.png", views(recording, result), f"{name}: the map seen from the estimated poses"
+        folder / "renders.png",
+        views(recording, result, render),
+        f"{name}: the map seen from the estimated poses",
     )
     if motion is not None:
         title = f"{name}: IMU against the derivatives of the final field"

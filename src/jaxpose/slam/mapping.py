@@ -16,13 +16,19 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from jaxpose import se3
-from jaxpose.camera import Camera, project
+from jaxpose.camera import Camera
 from jaxpose.losses import weighted_mean
 from jaxpose.render import Ray, composite, sdf_weights
 from jaxpose.scenes import GridConfig, SceneField, node_positions
 from jaxpose.scenes.base import Params
-from jaxpose.slam.observe import Image, SampleConfig, depth_sigma, sample_depths, sample_pixels
+from jaxpose.slam.observe import (
+    Image,
+    SampleConfig,
+    depth_sigma,
+    locate,
+    sample_depths,
+    sample_pixels,
+)
 
 _MEMORY = 100.0  # frames, at a depth of one metre: older ones are slowly forgotten
 
@@ -59,17 +65,13 @@ def make_fuse(config: GridConfig, camera: Camera, band: float):
     @partial(jax.jit, donate_argnums=0)
     def update(state: MapState, image: Image, T_world_cam: Float[Array, "4 4"]) -> MapState:
         ((values,), weight) = state
-        point_cam = se3.apply(se3.inverse(T_world_cam), jnp.asarray(nodes))
-        pixel = jnp.round(project(camera, point_cam))
-        column, row = pixel[..., 0], pixel[..., 1]
-        inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-        column, row = (jnp.where(inside, x, 0).astype(jnp.int32) for x in (column, row))
-        depth = image.depth[row, column]
-        distance = depth - point_cam[..., 2]
-        seen = inside & (depth > 0) & (distance > -band)
+        at = locate(camera, T_world_cam, jnp.asarray(nodes))
+        depth = image.depth[at.row, at.column]
+        distance = depth - at.depth
+        seen = at.inside & (depth > 0) & (distance > -band)
         worth = jnp.where(seen, (depth_sigma(jnp.ones(())) / depth_sigma(depth)) ** 2, 0)
         surface = jnp.where(jnp.abs(distance) < band, worth, 0)
-        rgb = image.rgb[row, column].astype(values.dtype) / 255
+        rgb = image.rgb[at.row, at.column].astype(values.dtype) / 255
         measured = jnp.concatenate([jnp.minimum(distance, band)[..., None], rgb], axis=-1)
         gain = jnp.stack([worth, surface, surface, surface], axis=-1)
         total = weight + gain

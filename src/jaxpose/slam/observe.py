@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt8
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt8
 
 from jaxpose import render, se3
-from jaxpose.camera import Camera, pixel_direction
+from jaxpose.camera import Camera, pixel_direction, project
 from jaxpose.render import Query, Ray, Rendered
 
 
@@ -26,6 +26,15 @@ class Pixels(NamedTuple):
     direction_cam: Float[Array, "n 3"]
     depth: Float[Array, " n"]
     rgb: Float[Array, "n 3"]
+
+
+class Located(NamedTuple):
+    """World points as an image has them: their depth [m] and nearest pixel, (0, 0) where it is not inside."""
+
+    depth: Float[Array, "*n"]
+    row: Int[Array, "*n"]
+    column: Int[Array, "*n"]
+    inside: Bool[Array, "*n"]
 
 
 @dataclass(frozen=True)
@@ -84,6 +93,16 @@ def render_pixels(
     depths = jax.vmap(partial(sample_depths, config=config), in_axes=(0, None))(pixels.depth, far)
     weights = render.surface_weights(config.width)
     return jax.vmap(lambda r, d: render.render_ray(query, r, d, weights=weights))(ray, depths)
+
+
+def locate(camera: Camera, T_world_cam: Float[Array, "4 4"], points: Float[Array, "*n 3"]) -> Located:
+    """Where an image taken from a pose has points of the world [m]."""
+    point_cam = se3.apply(se3.inverse(T_world_cam), points)
+    pixel = jnp.round(project(camera, point_cam))
+    column, row = pixel[..., 0], pixel[..., 1]
+    inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    column, row = (jnp.where(inside, x, 0).astype(jnp.int32) for x in (column, row))
+    return Located(point_cam[..., 2], row, column, inside)
 
 
 def back_project(pixels: Pixels, T_world_cam: Float[Array, "4 4"]) -> Float[Array, "n 3"]:

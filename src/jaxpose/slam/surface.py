@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from scipy.ndimage import map_coordinates
 
-from jaxpose import se3
-from jaxpose.camera import Camera, pixel_direction, project
+from jaxpose.camera import Camera
 from jaxpose.scenes import GridConfig
 from jaxpose.slam.keyframes import Keyframe
+from jaxpose.slam.observe import back_project, locate, read_pixels
 
 
 class Surface(NamedTuple):
@@ -28,16 +28,17 @@ class Surface(NamedTuple):
 
 def cloud(keyframes: Sequence[Keyframe], camera: Camera, voxel: float) -> Surface:
     """Measured points of the keyframes, one (the first that came) in each cube of `voxel` [m]."""
-    row, column = np.mgrid[: camera.height, : camera.width]
-    pixel = jnp.asarray(np.stack([column, row], axis=-1), jnp.float32)
-    direction = np.asarray(jax.jit(pixel_direction, static_argnums=0)(camera, pixel), np.float64)
+    row, column = (jnp.asarray(x.ravel()) for x in np.mgrid[: camera.height, : camera.width])
+
+    @jax.jit
+    def measured(image, T_world_cam):
+        return back_project(read_pixels(image, camera, row, column), T_world_cam)
+
     points, colours = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     for keyframe in keyframes:
-        depth = np.asarray(keyframe.image.depth, np.float64)
-        seen = depth > 0
-        T = keyframe.T_world_cam
-        found = direction[seen] * depth[seen][:, None] @ T[:3, :3].T + T[:3, 3]
-        points = np.concatenate([points, found])
+        seen = np.asarray(keyframe.image.depth) > 0
+        found = measured(keyframe.image, jnp.asarray(keyframe.T_world_cam, jnp.float32))
+        points = np.concatenate([points, np.asarray(found, np.float64)[seen.ravel()]])
         colours = np.concatenate([colours, np.asarray(keyframe.image.rgb)[seen]])
         first = np.unique(np.floor(points / voxel).astype(np.int64), axis=0, return_index=True)[1]
         points, colours = points[np.sort(first)], colours[np.sort(first)]  # so that memory stays bounded
@@ -78,13 +79,9 @@ def _seen(
 
     @jax.jit
     def by(points, image, T_world_cam):
-        point_cam = se3.apply(se3.inverse(T_world_cam), points)
-        pixel = jnp.round(project(camera, point_cam))
-        column, row = pixel[:, 0], pixel[:, 1]
-        inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-        column, row = (jnp.where(inside, x, 0).astype(jnp.int32) for x in (column, row))
-        depth = image.depth[row, column]
-        return inside & (depth > 0) & (jnp.abs(depth - point_cam[:, 2]) < band)
+        at = locate(camera, T_world_cam, points)
+        depth = image.depth[at.row, at.column]
+        return at.inside & (depth > 0) & (jnp.abs(depth - at.depth) < band)
 
     as_float = jnp.asarray(points, jnp.float32)
     seen = np.zeros(len(points), bool)
