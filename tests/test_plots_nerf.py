@@ -126,9 +126,12 @@ def test_held_out(tmp_path, figures, count):
     assert shown[3].texts[0].get_text() == f"PSNR {-10 * np.log10(mse):.2f} dB"
 
 
-def test_a_sheet_without_any_depth(tmp_path):
+def test_a_sheet_without_any_depth(tmp_path, figures):
     plots_nerf.held_out(tmp_path / "held_out.png", [view(np.random.default_rng(0), 0.0)], "a title")
-    read(tmp_path / "held_out.png")
+    assert read(tmp_path / "held_out.png").shape[2] == 3
+    (figure,) = figures
+    depth = [axes for axes in figure.axes if axes.images][2].images[0].get_array()
+    assert not np.isfinite(np.ma.filled(depth, np.nan)).any()  # shown as none, not as a depth of 0
 
 
 @pytest.mark.parametrize("names", [("posenet",), ("posenet", "table", "bspline")])
