@@ -1,4 +1,4 @@
-"""What a loader returns: a camera recording with depth, images read lazily, or photographs held in memory."""
+"""What a loader returns: a recording with depth, photographs, or events, and what is known beside them."""
 
 from collections.abc import Callable
 from typing import Literal, NamedTuple
@@ -8,6 +8,7 @@ from jaxtyping import Float, Int, UInt8
 
 from jaxpose.camera import Camera
 from jaxpose.errors import DataError
+from jaxpose.events import Events, Mosaic
 from jaxpose.imu import Imu
 
 
@@ -45,6 +46,22 @@ class Photographs(NamedTuple):
     far: float
     spacing: Literal["depth", "disparity"]  # what samples between near and far are equally spaced in
     files: tuple[str, ...]  # each image's name, as its source writes it
+    notes: tuple[str, ...] = ()  # what the loader has to tell the user
+
+
+class EventRecording(NamedTuple):
+    """Events of a moving camera with the poses known at some instants; camera axes OpenCV."""
+
+    name: str
+    camera: Camera
+    mosaic: Mosaic
+    events: Events
+    t: Float[np.ndarray, " k"]  # [s] of the poses, on the clock of `events`, increasing
+    T_world_cam: Float[np.ndarray, "k 4 4"]  # float64, finite
+    threshold: float | None = None  # change of log intensity per event; None: the source does not tell
+    cyclic: bool = False  # whether the motion returns to where it began, as on a turntable
+    frames: Photographs | None = None  # the camera's own images on the same clock, where it takes any
+    held_out: Photographs | None = None  # views to measure a reconstruction on
     notes: tuple[str, ...] = ()  # what the loader has to tell the user
 
 
