@@ -1,4 +1,4 @@
-"""Event cameras: every pixel reports, by itself and at once, that its brightness has changed by a threshold."""
+"""Event cameras: every pixel reports by itself, and at once, that its brightness has changed."""
 
 from typing import Literal, NamedTuple
 
