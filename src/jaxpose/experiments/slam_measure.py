@@ -49,7 +49,7 @@ def cost(result: SlamResult) -> dict[str, Any]:
         "seconds_per_frame_mean_with_compilation": float(result.seconds.mean()),
         "iterations_mean": float(result.iterations[1:].mean()),
         "depth_error_median_m": metrics.statistics(result.depth_error).median,
-        "keyframes": [keyframe.index for keyframe in result.keyframes],
+        "keyframes": result.keyframes,
         "field_rmse_m": result.field_rmse_m,
         "field_rmse_deg": result.field_rmse_deg,
     }

@@ -25,8 +25,10 @@ def progress_bar() -> Callable[[ImuMode, Progress], None]:
             bar = tqdm(total=progress.count, desc=f"IMU {mode}", unit="frame", file=sys.stderr)
             lost = 0
         assert bar is not None
-        lost += progress.lost
-        state = {} if progress.tracked is None else {"loss": f"{float(progress.tracked.loss):.2f}"}
+        frames = progress.state.frames
+        lost += bool(frames.lost[progress.index])
+        loss = float(frames.loss[progress.index])
+        state = {"loss": f"{loss:.2f}"} if math.isfinite(loss) else {}  # the first frame has none
         if math.isfinite(progress.truth_error):
             state["off"] = f"{100 * progress.truth_error:.1f} cm"
         bar.set_postfix(state | {"lost": str(lost)}, refresh=False)

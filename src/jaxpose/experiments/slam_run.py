@@ -23,6 +23,7 @@ from jaxpose.io_camera import write_camera
 from jaxpose.io_field import bspline_factor, write_field
 from jaxpose.io_ply import write_ply
 from jaxpose.recording import Recording
+from jaxpose.slam.keyframes import read_keyframes
 from jaxpose.slam.run import ImuMode, Progress, SlamResult
 from jaxpose.slam.run import run as track
 from jaxpose.slam.surface import cloud, mesh
@@ -144,11 +145,12 @@ def _single(
 
 def _write_surface(folder: Path, recording: Recording, result: SlamResult) -> tuple[str, ...]:
     """The map as a point cloud and, where scikit-image is installed, as a mesh; a note where it is not."""
-    points = cloud(result.keyframes, recording.camera, result.grid.voxel)
+    keyframes = partial(read_keyframes, recording, result.keyframes, result.T_world_cam)
+    points = cloud(keyframes(), recording.camera, result.grid.voxel)
     write_ply(folder / "points.ply", points.points, points.rgb)
     try:
         (values,) = result.scene_params
-        surface = mesh(result.grid, np.asarray(values), result.keyframes, recording.camera)
+        surface = mesh(result.grid, np.asarray(values), keyframes(), recording.camera)
     except ImportError:
         return ('no mesh.ply: pip install "jaxpose[mesh]" for marching cubes',)
     write_ply(folder / "mesh.ply", surface.points, surface.rgb, surface.faces)

@@ -1,10 +1,14 @@
 """Keyframes: which frames are kept, and which of them a mapping step looks at again."""
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float, Int
 
 from jaxpose.camera import Camera
+from jaxpose.recording import Recording
 from jaxpose.slam.observe import Image
 
 
@@ -14,6 +18,19 @@ class Keyframe(NamedTuple):
     index: int
     image: Image
     T_world_cam: np.ndarray  # (4, 4)
+
+
+def read_keyframes(
+    recording: Recording, indices: Int[np.ndarray, " k"], T_world_cam: Float[np.ndarray, "n 4 4"]
+) -> Iterator[Keyframe]:
+    """Keyframes one after the other, their images read anew, so that none is kept in memory.
+
+    `T_world_cam` holds the poses of all frames.
+    """
+    for i in indices.tolist():
+        frame = recording.read(i)
+        image = Image(jnp.asarray(frame.rgb), jnp.asarray(frame.depth, jnp.float32))
+        yield Keyframe(i, image, T_world_cam[i])
 
 
 def overlap(

@@ -2,26 +2,24 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import partial
-from typing import Any, Literal, NamedTuple
+from functools import lru_cache, partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float, Int, PRNGKeyArray
 
 from jaxpose import imu as inertial
 from jaxpose import se3
 from jaxpose.errors import DataError
-from jaxpose.fields import PoseField, PoseNetConfig, bspline, control_points, fit, stamped
-from jaxpose.imu import ADIS16448, ImuNoise, ResidualSigmas
+from jaxpose.fields import PoseField, bspline, control_points, fit, stamped
+from jaxpose.imu import ResidualSigmas
 from jaxpose.metrics import nearest_rotation
 from jaxpose.recording import Frame, Recording
-from jaxpose.scenes import GridConfig, SceneField, box, grid, grow, merge
-from jaxpose.slam.frames import FrameName, gauge, make_field
-from jaxpose.slam.keyframes import Keyframe, choose, overlap
-from jaxpose.slam.mapping import MapConfig, MapState, make_descend, make_fuse
-from jaxpose.slam.objective import ImuWeights, TrackConfig
+from jaxpose.scenes import GridConfig, SceneField
+from jaxpose.slam.config import IMU_WEIGHTS, ImuMode, SlamConfig
+from jaxpose.slam.frames import Framed, gauge, make_field
 from jaxpose.slam.observe import Image
 from jaxpose.slam.predict import (
     BEHIND,
@@ -33,57 +31,18 @@ from jaxpose.slam.predict import (
     observe_acceleration,
     predict,
     prediction_sigma,
-)  # fmt: skip
-from jaxpose.slam.track import Tracked, make_settle, make_track
+)
+from jaxpose.slam.state import SlamState, no_frames
+from jaxpose.slam.track import Tracked, make_settle
+from jaxpose.slam.world import World, first_grid, make_world, map_frame, room_for, scene_params, seen_points
 
-ImuMode = Literal["none", "loose", "tight", "accelerometer", "combined"]
-
-IMU_WEIGHTS: dict[ImuMode, ImuWeights] = {
-    "none": ImuWeights(),
-    "loose": ImuWeights(loose=1.0),
-    "tight": ImuWeights(tight=1.0),
-    "accelerometer": ImuWeights(accelerometer=1.0),
-    "combined": ImuWeights(loose=1.0, tight=1.0, accelerometer=1.0),
-}
-
-_USES_SPEED = ("accelerometer", "combined")
+__all__ = ["ImuMode", "Progress", "SlamConfig", "SlamResult", "run"]
 
 # How well a PoseNet over a few frames follows a hand's motion between them: added to the sensor's own noise.
 FIELD_SIGMAS = ResidualSigmas(loose=0.004, tight=0.1, accelerometer=1.0)
 
 
-@dataclass(frozen=True)
-class SlamConfig:
-    """Settings of a run; every random choice follows from `seed`."""
-
-    imu: ImuMode = "none"
-    frame: FrameName = "anchored"
-    seed: int = 0
-    field: PoseNetConfig = PoseNetConfig(layers=4, width=128, activation="softplus")
-    track: TrackConfig = TrackConfig()
-    map: MapConfig = MapConfig()
-    map_every_s: float = 0.15  # [s] between mapping steps
-    voxel: float | None = None  # [m]; None: from the size of the room
-    hold_out: int = 0  # every n-th frame is tracked but never mapped, to measure the map on; 0: none
-    keyframe_overlap: float = 0.9  # a frame that shares less with every keyframe becomes one
-    imu_noise: ImuNoise = ADIS16448
-
-    def __post_init__(self):
-        positive = {
-            "track.pixels": self.track.pixels,
-            "track.iterations": self.track.iterations,
-            "track.field_steps": self.track.field_steps,
-            "map.window": self.map.window,
-            "map.iterations": self.map.iterations,
-            "map.first_iterations": self.map.first_iterations,
-            "field.layers": self.field.layers,
-            "field.width": self.field.width,
-        }
-        for name, value in positive.items():
-            if value < 1:
-                raise ValueError(f"{name}: expected 1 or more, got {value}")
-        if self.hold_out == 1 or self.hold_out < 0:
-            raise ValueError(f"hold_out: expected 0, or 2 or more, got {self.hold_out}")
+_DEFAULT = SlamConfig()
 
 
 class Progress(NamedTuple):
@@ -91,10 +50,8 @@ class Progress(NamedTuple):
 
     index: int
     count: int
-    tracked: Tracked | None  # None: the first frame
-    lost: bool
+    state: SlamState  # valid until the next frame, which writes over its map
     truth_error: float
-    seconds: float
 
 
 class SlamResult(NamedTuple):
@@ -111,119 +68,176 @@ class SlamResult(NamedTuple):
     scene: SceneField
     grid: GridConfig
     scene_params: Any
-    keyframes: list[Keyframe]
+    keyframes: Int[np.ndarray, " k"]  # which frames they are
     field: PoseField  # camera in the world over the whole recording
     field_params: Any
     field_rmse_m: float
     field_rmse_deg: float
 
 
-class _World(NamedTuple):
-    """The map, and the steps compiled for its size."""
+class System(NamedTuple):
+    """What does not change from frame to frame; `world` compiles for a size of the map."""
 
-    grid: GridConfig
-    scene: SceneField
-    state: MapState
-    merged: Any  # the scene as tracking reads it
-    track: Callable[..., Tracked]
-    update: Callable[..., tuple[MapState, jax.Array]]
+    recording: Recording
+    config: SlamConfig
+    framed: Framed
+    readings: Callable[[int, np.ndarray, np.ndarray], Readings]
+    world: Callable[[GridConfig], World]
 
 
 def run(
     recording: Recording,
-    config: SlamConfig = SlamConfig(),
+    config: SlamConfig = _DEFAULT,
     on_frame: Callable[[Progress], None] | None = None,
+    state: SlamState | None = None,
 ) -> SlamResult:
     """Track every frame of an RGB-D recording and map what it sees (paper section 3.4, METHOD section 5).
 
     The world's frame is that of the truth where its first pose is known (as in NICE-SLAM), else the first
-    camera's; `gravity_world` must be in that frame. Raises DataError where the recording cannot be
-    tracked: fewer than two frames, no depth in the first, IMU asked for and not there.
+    camera's; `gravity_world` must be in that frame. `state` is where an earlier run stood, to go on from
+    there. Raises DataError where the recording cannot be tracked: fewer than two frames, no depth in the
+    first, IMU asked for and not there.
     """
-    windows = _inertial_windows(recording, config)
-    generator = np.random.default_rng(config.seed)
-    key = jax.random.key(config.seed)
-    key, field_key = jax.random.split(key)
-    T_body_cam = np.asarray(recording.T_body_cam, np.float64)
-    T_cam_body = np.linalg.inv(T_body_cam)
+    system = make_system(recording, config)
+    state = begin(system) if state is None else state
+    for i in range(state.done, len(recording.t)):
+        started = time.perf_counter()
+        state = step(system, state, recording.read(i))
+        jax.block_until_ready(state.map)
+        state = state._replace(frames=state.frames.put(i, seconds=time.perf_counter() - started))
+        if on_frame is not None:
+            on_frame(Progress(i, len(recording.t), state, _truth_error(recording, state)))
+    return _finish(system, state)
+
+
+def make_system(recording: Recording, config: SlamConfig) -> System:
+    """The compiled parts of a run; checks what can be checked beforehand."""
+    readings = _readings(recording, config)
     t = recording.t
     framed = make_field(config.frame, config.field, float(np.median(np.diff(t))), float(t[-1] - t[0]))
-    params = framed.field.init(field_key)
     settle = make_settle(framed, config.track, IMU_WEIGHTS[config.imu], _sigmas(recording, config))
-    compile_world = partial(_compile, recording, config, settle)
+    world = lru_cache(maxsize=1)(partial(make_world, recording, config, settle))
+    return System(recording, config, framed, readings, world)
 
-    T_world_cam = [_first_pose(recording)]
-    T_world_body = [T_world_cam[0] @ T_cam_body]
-    velocity, twist, offset = np.zeros(3), np.zeros(6), np.zeros(3)
-    records: list[tuple[bool, Tracked | None, float]] = []
-    mapped: list[int] = []
-    keyframes: list[Keyframe] = []
-    world, far, mapped_at = None, 0.0, -np.inf
 
-    for i in range(len(t)):
-        started = time.perf_counter()
-        frame = recording.read(i)
-        image = Image(jnp.asarray(frame.rgb), jnp.asarray(frame.depth, jnp.float32))
-        key, track_key, map_key = jax.random.split(key, 3)
-        tracked, lost = None, False
-        if world is not None:
-            dt = float(t[i] - t[i - 1])
-            readings = windows(i - 1, T_world_body[-1], offset)
-            interval, predicted = _interval(dt, T_world_body, t[:i], twist, velocity, readings, config.imu)
-            where = gauge(config.frame, float(t[i - 1] - t[0]), T_world_body[-1], T_world_body[0], generator)
-            tracked = world.track(
-                world.merged, params, jnp.asarray(T_world_body[-1], jnp.float32), where, interval, image,
-                jnp.float32(far), track_key,
-            )  # fmt: skip
-            tracked = jax.device_get(tracked)
-            params = tracked.params
-            lost = _failed(
-                tracked, [float(r[1].loss) for r in records if r[1] is not None and not r[0]], config
-            )
-            T_ref_body = predicted if lost else np.asarray(tracked.T_ref_body, np.float64)
-            T_world_body.append(T_world_body[-1] @ T_ref_body)
-            T_world_body[-1][:3, :3] = nearest_rotation(T_world_body[-1][:3, :3])  # float32 adds up
-            T_world_cam.append(T_world_body[-1] @ T_body_cam)
-            if i > 1 and not lost and config.imu in _USES_SPEED:  # the first speed is not known
-                error = T_world_body[-2][:3, :3] @ (T_ref_body[:3, 3] - predicted[:3, 3])
-                offset = observe_acceleration(offset, dt, error)
-            twist = np.asarray(se3.log(jnp.asarray(T_ref_body, jnp.float32)), np.float64) / dt
-            velocity = end_velocity(dt, T_ref_body, readings, speed=config.imu in _USES_SPEED)
-
-        points = _points(frame, recording, T_world_cam[-1])
-        if world is None and len(points) == 0:
+def begin(system: System, size: GridConfig | None = None) -> SlamState:
+    """A run before its first frame, its map of a given size or for what that frame sees."""
+    recording, config = system.recording, system.config
+    frames = no_frames(len(recording.t))
+    T_world_cam = _first_pose(recording)
+    frames.T_world_body[0] = T_world_cam @ np.linalg.inv(recording.T_body_cam)
+    if size is None:
+        points = seen_points(recording.read(0), recording, T_world_cam)
+        if len(points) == 0:
             raise DataError(f"{recording.name}: expected depth in the first frame, found none")
-        held_out = config.hold_out > 0 and i % config.hold_out == config.hold_out - 1
-        if not lost and not held_out and len(points) and t[i] - mapped_at >= config.map_every_s:
-            far = max(
-                far, 1.2 * float(np.percentile(np.linalg.norm(points - T_world_cam[-1][:3, 3], axis=1), 99))
-            )
-            world = _room_for(points, world, config, compile_world)
-            shares = (
-                overlap(points, np.stack([k.T_world_cam for k in keyframes]), recording.camera)
-                if keyframes
-                else np.zeros(0)
-            )
-            world = _mapped(world, image, T_world_cam[-1], keyframes, shares, far, config, generator, map_key)
-            mapped_at = t[i]
-            mapped.append(i)
-            if not keyframes or shares.max() < config.keyframe_overlap:
-                keyframes.append(Keyframe(i, image, T_world_cam[-1]))
-        assert world is not None  # made from the first frame
-        jax.block_until_ready(world.merged)
-        seconds = time.perf_counter() - started
-        records.append((lost, tracked, seconds))
-        if on_frame is not None:
-            on_frame(Progress(i, len(t), tracked, lost, _truth_error(recording, i, T_world_cam), seconds))
-
-    return _finish(recording, np.stack(T_world_cam), records, mapped, world, keyframes)
+        size = first_grid(points, config)
+    key, field_key = jax.random.split(jax.random.key(config.seed))
+    return SlamState(
+        0, frames, np.zeros(6), np.zeros(3), np.zeros(3),
+        system.framed.field.init(field_key), key, 0.0, size, system.world(size).start(),
+    )  # fmt: skip
 
 
-def _inertial_windows(recording: Recording, config: SlamConfig) -> Callable[..., Readings]:
-    """The readings after each frame, given the body's pose and the false acceleration [m/s^2] then.
+def step(system: System, state: SlamState, frame: Frame) -> SlamState:
+    """The run after one more frame. The map of `state` is written over."""
+    recording, config, i = system.recording, system.config, state.done
+    generator = np.random.default_rng([config.seed, i])
+    key, track_key, map_key = jax.random.split(state.key, 3)
+    image = Image(jnp.asarray(frame.rgb), jnp.asarray(frame.depth, jnp.float32))
+    if i > 0:
+        state = _tracked(system, state, image, generator, track_key)
+    state = state._replace(done=i + 1, key=key)
+    T_world_cam = state.frames.T_world_body[i] @ recording.T_body_cam
+    points = seen_points(frame, recording, T_world_cam)
+    if state.frames.lost[i] or len(points) == 0 or not _due(system, state):
+        return state
+    away = np.linalg.norm(points - T_world_cam[:3, 3], axis=1)
+    state = state._replace(far=max(state.far, 1.2 * float(np.percentile(away, 99))))
+    state = room_for(points, state)
+    return map_frame(system.world(state.grid), recording, config, state, image, points, generator, map_key)
 
-    Checks what can be checked beforehand.
-    """
+
+def _tracked(
+    system: System, state: SlamState, image: Image, generator: np.random.Generator, key: PRNGKeyArray
+) -> SlamState:
+    """The state with the next frame's pose."""
+    (recording, config), i, frames = system[:2], state.done, state.frames
+    t, T_world_ref = recording.t, frames.T_world_body[i - 1]
+    dt = float(t[i] - t[i - 1])
+    readings = system.readings(i - 1, T_world_ref, state.false_acceleration)
+    interval, predicted = _interval(system, state, dt, readings)
+    where = gauge(config.frame, float(t[i - 1] - t[0]), T_world_ref, frames.T_world_body[0], generator)
+    tracked = system.world(state.grid).track(
+        scene_params(state.map), state.params, jnp.asarray(T_world_ref, jnp.float32), where, interval, image,
+        jnp.float32(state.far), key,
+    )  # fmt: skip
+    tracked = jax.device_get(tracked)
+    lost = _failed(tracked, frames.loss[1:i][~frames.lost[1:i]], config)
+    T_ref_body = predicted if lost else np.asarray(tracked.T_ref_body, np.float64)
+    T_world_body = T_world_ref @ T_ref_body
+    T_world_body[:3, :3] = nearest_rotation(T_world_body[:3, :3])  # float32 adds up
+    false_acceleration = state.false_acceleration
+    if i > 1 and not lost and config.senses_speed:  # the first speed is not known
+        error = T_world_ref[:3, :3] @ (T_ref_body[:3, 3] - predicted[:3, 3])
+        false_acceleration = observe_acceleration(false_acceleration, dt, error)
+    return state._replace(
+        frames=frames.put(
+            i,
+            T_world_body=T_world_body,
+            lost=lost,
+            iterations=tracked.iterations,
+            loss=tracked.loss,
+            depth_error=tracked.depth_error,
+            valid=tracked.valid,
+        ),
+        twist=np.asarray(se3.log(jnp.asarray(T_ref_body, jnp.float32)), np.float64) / dt,
+        velocity_body=end_velocity(dt, T_ref_body, readings, speed=config.senses_speed),
+        false_acceleration=false_acceleration,
+        params=tracked.params,
+    )
+
+
+def _interval(
+    system: System, state: SlamState, dt: float, readings: Readings
+) -> tuple[Interval, Float[np.ndarray, "4 4"]]:
+    """What tracking the next frame starts from, and the predicted motion of the whole interval."""
+    last, t, T_world_body = state.done - 1, system.recording.t, state.frames.T_world_body
+    senses = {"rotation": system.config.senses_rotation, "speed": system.config.senses_speed}
+    stamps, poses = predict(dt, state.twist, state.velocity_body, readings, **senses)
+    # Without two frames the speed is not known, and the accelerometer only changes it.
+    senses["speed"] &= last > 0
+    behind = [max(last - k, 0) for k in range(BEHIND + 1)]  # the last frame itself, and those before
+    past = np.linalg.inv(T_world_body[last]) @ T_world_body[behind]
+    sigma = prediction_sigma(dt, poses[-1], **senses)
+    if last == 0:
+        sigma = sigma + [0.3 * dt, 0.0 if senses["rotation"] else 0.3 * dt]  # as fast as a hand may move
+    as_float = lambda x: jnp.asarray(x, jnp.float32)
+    return Interval(
+        as_float(dt),
+        as_float(np.concatenate([stamps, t[behind] - t[last]])),
+        as_float(np.concatenate([poses, past])),
+        as_float(sigma),
+        readings,
+    ), poses[-1]
+
+
+def _failed(tracked: Tracked, losses: Float[np.ndarray, " k"], config: SlamConfig) -> bool:
+    """Whether tracking went wrong: too little of the image explained, or far worse than it usually is."""
+    usual = float(np.median(losses[-30:])) if len(losses) else np.inf
+    explained = np.isfinite(tracked.loss) and tracked.valid >= config.track.minimum_valid
+    return not (explained and tracked.loss < 2 * usual)
+
+
+def _due(system: System, state: SlamState) -> bool:
+    """Whether the last frame is to be mapped."""
+    config, t, i = system.config, system.recording.t, state.done - 1
+    held_out = config.hold_out > 0 and i % config.hold_out == config.hold_out - 1
+    mapped = np.flatnonzero(state.frames.mapped)
+    return not held_out and (len(mapped) == 0 or t[i] - t[mapped[-1]] >= config.map_every_s)
+
+
+def _readings(recording: Recording, config: SlamConfig) -> Callable[[int, np.ndarray, np.ndarray], Readings]:
+    """The readings after each frame, given the body's pose and the false acceleration [m/s^2] then."""
     if len(recording.t) < 2:
         raise DataError(f"{recording.name}: expected at least 2 frames, got {len(recording.t)}")
     if config.imu == "none":
@@ -243,69 +257,10 @@ def _inertial_windows(recording: Recording, config: SlamConfig) -> Callable[...,
     return window
 
 
-def _first_pose(recording: Recording) -> np.ndarray:
+def _first_pose(recording: Recording) -> Float[np.ndarray, "4 4"]:
     if recording.T_world_cam is not None and np.isfinite(recording.T_world_cam[0]).all():
         return np.array(recording.T_world_cam[0], np.float64)
     return np.eye(4)
-
-
-def _interval(dt, T_world_body, t, twist, velocity, readings, mode) -> tuple[Interval, np.ndarray]:
-    """What tracking starts from, and the predicted motion of the whole interval."""
-    # Without two frames the speed is not known, and the accelerometer only changes it.
-    senses = {"rotation": mode != "none", "speed": mode in _USES_SPEED}
-    stamps, poses = predict(dt, twist, velocity, readings, **senses)
-    senses["speed"] &= len(t) > 1
-    T_ref_world = np.linalg.inv(T_world_body[-1])
-    behind = [max(len(t) - 1 - k, 0) for k in range(BEHIND + 1)]  # the last frame itself, and those before
-    past = np.stack([T_ref_world @ T_world_body[k] for k in behind])
-    sigma = prediction_sigma(dt, poses[-1], **senses)
-    if len(t) == 1:
-        sigma = sigma + [0.3 * dt, 0.0 if senses["rotation"] else 0.3 * dt]  # as fast as a hand may move
-    as_float = lambda x: jnp.asarray(x, jnp.float32)
-    return Interval(
-        as_float(dt),
-        as_float(np.concatenate([stamps, t[behind] - t[-1]])),
-        as_float(np.concatenate([poses, past])),
-        as_float(sigma),
-        readings,
-    ), poses[-1]
-
-
-def _failed(tracked: Tracked, losses: list[float], config: SlamConfig) -> bool:
-    """Whether tracking went wrong: too little of the image explained, or far worse than it usually is."""
-    usual = float(np.median(losses[-30:])) if losses else np.inf
-    explained = np.isfinite(tracked.loss) and tracked.valid >= config.track.minimum_valid
-    return not (explained and tracked.loss < 2 * usual)
-
-
-def _points(frame: Frame, recording: Recording, T_world_cam: np.ndarray, step: int = 16) -> np.ndarray:
-    """World points (n, 3) of every 16th pixel in both directions that has depth, float64."""
-    camera = recording.camera
-    row, column = np.mgrid[step // 2 : camera.height : step, step // 2 : camera.width : step]
-    depth = frame.depth[row, column]
-    seen = depth > 0
-    ray = np.stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy, np.ones(row.shape)], -1)
-    points = ray[seen] * depth[seen][:, None]
-    return points @ T_world_cam[:3, :3].T + T_world_cam[:3, 3]
-
-
-def _compile(recording, config, settle, grid_config: GridConfig, state: MapState | None) -> _World:
-    """The map's compiled steps for a grid; a map that starts if there is no state yet."""
-    scene = grid(grid_config)
-    scale = {"band": grid_config.truncation, "width": grid_config.truncation / 8}
-    if config.map.method == "fused":
-        init_map, update = make_fuse(grid_config, recording.camera, grid_config.truncation)
-    else:
-        map_config = replace(config.map, sample=replace(config.map.sample, **scale))
-        init_map, update = make_descend(scene, recording.camera, map_config)
-    track_config = replace(config.track, sample=replace(config.track.sample, **scale))
-    T_body_cam = jnp.asarray(recording.T_body_cam, jnp.float32)
-    track = make_track(scene, recording.camera, T_body_cam, track_config, settle)
-    state = init_map(scene.init(jax.random.key(0))) if state is None else state
-    return _World(grid_config, scene, state, _merge(state.params), track, update)
-
-
-_merge = jax.jit(merge)
 
 
 def _sigmas(recording: Recording, config: SlamConfig) -> ResidualSigmas:
@@ -317,51 +272,22 @@ def _sigmas(recording: Recording, config: SlamConfig) -> ResidualSigmas:
     return ResidualSigmas(*(float(np.hypot(a, b)) for a, b in zip(sensor, FIELD_SIGMAS, strict=True)))
 
 
-def _room_for(points, world: _World | None, config: SlamConfig, compile_world) -> _World:
-    """A world whose grid holds the points; a few stray ones do not make it grow."""
-    lower, upper = np.percentile(points, [1, 99], axis=0)
-    corners = np.stack([lower, upper])
-    if world is None:
-        levels = 1 if config.map.method == "fused" else 2
-        return compile_world(box(corners, voxel=config.voxel, levels=levels), None)
-    if (lower >= world.grid.lower).all() and (upper <= world.grid.upper).all():
-        return world
-    return compile_world(*grow(world.grid, world.state, corners))
-
-
-def _mapped(world, image, T_world_cam, keyframes, shares, far, config, generator, key) -> _World:
-    """The world after a mapping step on this frame and keyframes that overlap it."""
-    if config.map.method == "fused":
-        state = world.update(world.state, image, jnp.asarray(T_world_cam, jnp.float32))
-        return world._replace(state=state, merged=state.params)
-    first = not keyframes
-    others = [] if first else [keyframes[k] for k in choose(shares, config.map.window - 1, generator)]
-    images = [image] * config.map.window if first else [image, *(k.image for k in others)]
-    poses = [T_world_cam] * config.map.window if first else [T_world_cam, *(k.T_world_cam for k in others)]
-    state, _ = world.update(
-        world.state,
-        jax.tree.map(lambda *x: jnp.stack(x), *images),
-        jnp.asarray(np.stack(poses), jnp.float32),
-        jnp.float32(far),
-        jnp.float32(config.map.first_rate if first else config.map.learning_rate),
-        jnp.int32(config.map.first_iterations if first else config.map.iterations),
-        key,
-    )
-    return world._replace(state=state, merged=_merge(state.params))
-
-
-def _truth_error(recording: Recording, i: int, T_world_cam: list[np.ndarray]) -> float:
+def _truth_error(recording: Recording, state: SlamState) -> float:
     if recording.T_world_cam is None:
         return float("nan")
-    return float(np.linalg.norm(recording.T_world_cam[i, :3, 3] - T_world_cam[i][:3, 3]))
+    i = state.done - 1
+    estimate = state.frames.T_world_body[i] @ recording.T_body_cam
+    return float(np.linalg.norm(recording.T_world_cam[i, :3, 3] - estimate[:3, 3]))
 
 
-def _finish(recording, T_world_cam, records, mapped, world, keyframes) -> SlamResult:
+def _finish(system: System, state: SlamState) -> SlamResult:
     """One field fitted to all poses, and everything that was recorded on the way.
 
     A B-spline with a knot a frame: a PoseNet over the same 12 s of the default room stayed 1.5 cm from the
     poses, and where the camera had turned once around it took the other way.
     """
+    recording, frames = system.recording, state.frames
+    T_world_cam = frames.T_world_body @ recording.T_body_cam
     t = recording.t - recording.t[0]
     span = (0.0, float(t[-1]))
     intervals = max(round(t[-1] / float(np.median(np.diff(t)))), 1)
@@ -370,21 +296,19 @@ def _finish(recording, T_world_cam, records, mapped, world, keyframes) -> SlamRe
     between = jax.vmap(stamped(jnp.asarray(t, jnp.float32), jnp.asarray(T_world_cam, jnp.float32)))
     start = control_points(between(jnp.asarray(knots, jnp.float32)))
     fitted = fit(field, t, T_world_cam, params=start, steps=400, learning_rate=1e-3)
-    default = Tracked(None, np.eye(4), *[np.nan] * 3, 0)  # type: ignore[arg-type]
-    each = [tracked or default for _, tracked, _ in records]
     return SlamResult(
         T_world_cam,
-        lost=np.array([lost for lost, _, _ in records]),
-        mapped=np.isin(np.arange(len(records)), mapped),
-        iterations=np.array([int(x.iterations) for x in each]),
-        loss=np.array([float(x.loss) for x in each]),
-        depth_error=np.array([float(x.depth_error) for x in each]),
-        valid=np.array([float(x.valid) for x in each]),
-        seconds=np.array([s for _, _, s in records]),
-        scene=world.scene,
-        grid=world.grid,
-        scene_params=world.merged,
-        keyframes=keyframes,
+        lost=frames.lost,
+        mapped=frames.mapped,
+        iterations=frames.iterations,
+        loss=frames.loss,
+        depth_error=frames.depth_error,
+        valid=frames.valid,
+        seconds=frames.seconds,
+        scene=system.world(state.grid).scene,
+        grid=state.grid,
+        scene_params=scene_params(state.map),
+        keyframes=np.flatnonzero(frames.keyframe),
         field=field,
         field_params=fitted.params,
         field_rmse_m=float(fitted.translation_rmse_m),

@@ -1,6 +1,6 @@
 """What a map looks like to other programs: a coloured point cloud, and a mesh of what was seen."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import jax
@@ -26,7 +26,7 @@ class Surface(NamedTuple):
     faces: Int[np.ndarray, "m 3"]
 
 
-def cloud(keyframes: Sequence[Keyframe], camera: Camera, voxel: float) -> Surface:
+def cloud(keyframes: Iterable[Keyframe], camera: Camera, voxel: float) -> Surface:
     """Measured points of the keyframes, one (the first that came) in each cube of `voxel` [m]."""
     row, column = (jnp.asarray(x.ravel()) for x in np.mgrid[: camera.height, : camera.width])
 
@@ -48,7 +48,7 @@ def cloud(keyframes: Sequence[Keyframe], camera: Camera, voxel: float) -> Surfac
 def mesh(
     grid: GridConfig,
     values: Float[np.ndarray, "x y z 4"],
-    keyframes: Sequence[Keyframe],
+    keyframes: Iterable[Keyframe],
     camera: Camera,
 ) -> Surface:
     """The zero of a map's signed distance by marching cubes, culled to what the keyframes have measured.
@@ -73,7 +73,7 @@ def mesh(
 
 
 def _seen(
-    points: Float[np.ndarray, "n 3"], keyframes: Sequence[Keyframe], camera: Camera, band: float
+    points: Float[np.ndarray, "n 3"], keyframes: Iterable[Keyframe], camera: Camera, band: float
 ) -> Bool[np.ndarray, " n"]:
     """Whether a keyframe has measured a depth within `band` [m] of each point's."""
 

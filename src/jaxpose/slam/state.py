@@ -1,0 +1,54 @@
+"""All that a run goes on from between two frames: what is saved is what is needed."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, PRNGKeyArray
+
+from jaxpose.fields import Params
+from jaxpose.scenes import GridConfig
+from jaxpose.slam.mapping import MapState
+
+
+class Frames(NamedTuple):
+    """What is known of every frame of a recording, one row a frame; of those to come NaN, False or 0."""
+
+    T_world_body: Float[np.ndarray, "n 4 4"]
+    lost: Bool[np.ndarray, " n"]  # tracking failed, the pose is the prediction
+    mapped: Bool[np.ndarray, " n"]  # the map was made from it
+    keyframe: Bool[np.ndarray, " n"]
+    iterations: Int[np.ndarray, " n"]
+    loss: Float[np.ndarray, " n"]
+    depth_error: Float[np.ndarray, " n"]  # [m] median
+    valid: Float[np.ndarray, " n"]
+    seconds: Float[np.ndarray, " n"]  # wall time, compilation included
+
+    def put(self, i: int, **values) -> "Frames":
+        """The same with other values at frame i."""
+        changed = {name: getattr(self, name).copy() for name in values}
+        for name, value in values.items():
+            changed[name][i] = value
+        return self._replace(**changed)
+
+
+class SlamState(NamedTuple):
+    """A run after `done` frames: a pytree of arrays, but for `grid`, which says how large those of `map` are."""
+
+    done: int
+    frames: Frames
+    twist: Float[np.ndarray, "6"]  # of the body over the last interval, per second
+    velocity_body: Float[np.ndarray, "3"]  # [m/s] at the last frame
+    false_acceleration: Float[np.ndarray, "3"]  # [m/s^2] in the world (`predict.observe_acceleration`)
+    params: Params  # of the tracked field
+    key: PRNGKeyArray
+    far: float  # [m] how deep the map is
+    grid: GridConfig
+    map: MapState
+
+
+def no_frames(count: int) -> Frames:
+    """Frames of which nothing is known yet."""
+    unknown, no = np.full(count, np.nan), np.zeros(count, bool)
+    return Frames(
+        np.full((count, 4, 4), np.nan), no, no, no, np.zeros(count, int), unknown, unknown, unknown, unknown
+    )
