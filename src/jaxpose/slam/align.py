@@ -123,5 +123,13 @@ def align(
     return best._replace(iterations=i)
 
 
+def pose_sigma(found: Alignment) -> Float[Array, "2"]:
+    """Standard deviation [m, rad] of an aligned pose along its worst axis."""
+    share = jnp.maximum(jnp.sum(found.residuals.inlier), 1) / _INDEPENDENT
+    covariance = jnp.linalg.inv(found.information / share + 1e-6 * jnp.eye(6))
+    worst = lambda block: jnp.sqrt(jnp.linalg.eigvalsh(block)[-1])
+    return jnp.stack([worst(covariance[:3, :3]), worst(covariance[3:, 3:])])
+
+
 def _vectors(residuals: Residuals):
     return (residuals.depth, residuals.colour), residuals

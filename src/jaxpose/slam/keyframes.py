@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxpose.camera import Camera
-from jaxpose.recording import Recording
+from jaxpose.recording import Frame, Recording
 from jaxpose.slam.observe import Image
 
 
@@ -31,6 +31,18 @@ def read_keyframes(
         frame = recording.read(i)
         image = Image(jnp.asarray(frame.rgb), jnp.asarray(frame.depth, jnp.float32))
         yield Keyframe(i, image, T_world_cam[i])
+
+
+def look(frame: Frame) -> Float[np.ndarray, "2 12 16"]:
+    """What a frame looks like from afar: grey and depth, each with mean 0 and spread 1."""
+    height, width = frame.depth.shape
+    row, column = height // 12, width // 16
+    cut = lambda x: x[: 12 * row, : 16 * column].reshape(12, row, 16, column)
+    depth, seen = cut(frame.depth), cut(frame.depth) > 0
+    deep = depth.sum((1, 3)) / np.maximum(seen.sum((1, 3)), 1)
+    channels = np.stack([cut(frame.rgb.mean(axis=-1)).mean((1, 3)), deep])
+    channels -= channels.mean((1, 2), keepdims=True)
+    return channels / np.maximum(channels.std((1, 2), keepdims=True), 1e-3)
 
 
 def overlap(

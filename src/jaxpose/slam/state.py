@@ -21,10 +21,11 @@ class Frames(NamedTuple):
     loss: Float[np.ndarray, " n"]
     depth_error: Float[np.ndarray, " n"]  # [m] median
     valid: Float[np.ndarray, " n"]
+    sigma: Float[np.ndarray, "n 2"]  # [m, rad] of the pose, by what the image says of it
     seconds: Float[np.ndarray, " n"]  # wall time, compilation included
 
-    def put(self, i: int, **values) -> "Frames":
-        """The same with other values at frame i."""
+    def put(self, i: int | Int[np.ndarray, " k"], **values) -> "Frames":
+        """The same with other values at a frame, or at some."""
         changed = {name: getattr(self, name).copy() for name in values}
         for name, value in values.items():
             changed[name][i] = value
@@ -32,7 +33,7 @@ class Frames(NamedTuple):
 
 
 class SlamState(NamedTuple):
-    """A run after `done` frames: a pytree of arrays, but for `grid`, which says how large those of `map` are."""
+    """A run after `done` frames: a pytree of arrays, but for `grid`, which says how large `map` is."""
 
     done: int
     frames: Frames
@@ -50,5 +51,14 @@ def no_frames(count: int) -> Frames:
     """Frames of which nothing is known yet."""
     unknown, no = np.full(count, np.nan), np.zeros(count, bool)
     return Frames(
-        np.full((count, 4, 4), np.nan), no, no, no, np.zeros(count, int), unknown, unknown, unknown, unknown
+        np.full((count, 4, 4), np.nan),
+        no,
+        no,
+        no,
+        np.zeros(count, int),
+        unknown,
+        unknown,
+        unknown,
+        np.full((count, 2), np.nan),
+        unknown,
     )

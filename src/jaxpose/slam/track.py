@@ -20,7 +20,7 @@ from jaxpose.camera import Camera
 from jaxpose.fields import Params, pin
 from jaxpose.imu import ResidualSigmas
 from jaxpose.scenes import SceneField
-from jaxpose.slam.align import align, best_start, starts
+from jaxpose.slam.align import align, best_start, pose_sigma, starts
 from jaxpose.slam.frames import Framed, Gauge, Motion
 from jaxpose.slam.objective import ImuWeights, TrackConfig, image_loss, image_residuals, imu_loss
 from jaxpose.slam.observe import sample_pixels
@@ -38,6 +38,7 @@ class Tracked(NamedTuple):
     depth_error: Float[Array, ""]  # [m] median over valid pixels
     valid: Float[Array, ""]  # share of pixels with depth that the map explains
     iterations: Int[Array, ""]
+    sigma: Float[Array, "2"]  # [m, rad] of the pose, by what the image says of it; NaN: not known
 
 
 class Settle(NamedTuple):
@@ -108,7 +109,13 @@ def make_track(
         start = best_start(query, T_world_tries, pixels, far, config)
         found = align(query, start, T_world_tries[0], interval.sigma, pixels, far, config)
         T_world_body = se3.compose(found.T_world_cam, se3.inverse(T_body_cam))
-        seen = found.loss, found.residuals.depth_error, found.residuals.valid, found.iterations
+        seen = (
+            found.loss,
+            found.residuals.depth_error,
+            found.residuals.valid,
+            found.iterations,
+            pose_sigma(found),
+        )
         return se3.compose(se3.inverse(T_world_ref), T_world_body), seen
 
     def gauss_newton(scene_params, params, T_world_ref, gauge, interval, image, far, key):
@@ -131,7 +138,8 @@ def make_track(
 
         (params, seen), i = _descend(loss, params, config, config.iterations, config.patience)
         image, error, valid = seen
-        return Tracked(params, settle.motion(params, gauge)(interval.t), image, error, valid, i)
+        unknown = jnp.full(2, jnp.nan)
+        return Tracked(params, settle.motion(params, gauge)(interval.t), image, error, valid, i, unknown)
 
     return gauss_newton if config.method == "gauss_newton" else gradient
 

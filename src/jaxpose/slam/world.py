@@ -2,12 +2,13 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxpose.recording import Frame, Recording
 from jaxpose.scenes import GridConfig, SceneField, box, grid, grow, merge
@@ -15,9 +16,12 @@ from jaxpose.scenes.base import Params
 from jaxpose.slam.config import SlamConfig
 from jaxpose.slam.keyframes import choose, overlap, read_keyframes
 from jaxpose.slam.mapping import MapState, make_descend, make_fuse
-from jaxpose.slam.observe import Image
+from jaxpose.slam.observe import Image, sample_pixels
+from jaxpose.slam.search import search as find
 from jaxpose.slam.state import SlamState
 from jaxpose.slam.track import Settle, Tracked, make_track
+
+_LOOKED_AT = 400  # pixels of a search
 
 
 class World(NamedTuple):
@@ -25,6 +29,7 @@ class World(NamedTuple):
 
     scene: SceneField
     start: Callable[[], MapState]
+    search: Callable[..., Float[Array, "4 4"]]
     track: Callable[..., Tracked]
     update: Callable[..., MapState]
 
@@ -41,7 +46,14 @@ def make_world(recording: Recording, config: SlamConfig, settle: Settle, size: G
     track_config = replace(config.track, sample=replace(config.track.sample, **scale))
     T_body_cam = jnp.asarray(recording.T_body_cam, jnp.float32)
     track = make_track(scene, recording.camera, T_body_cam, track_config, settle)
-    return World(scene, lambda: init_map(scene.init(jax.random.key(0))), track, update)
+
+    @jax.jit
+    def search(scene_params, T_world_cam, sigma, image, key):
+        pixel_key, key = jax.random.split(key)
+        pixels = sample_pixels(pixel_key, image, recording.camera, _LOOKED_AT, edge=config.track.edge)
+        return find(partial(scene.query, scene_params), T_world_cam, sigma, pixels, size.truncation, key)
+
+    return World(scene, lambda: init_map(scene.init(jax.random.key(0))), search, track, update)
 
 
 def scene_params(state: MapState) -> Params:

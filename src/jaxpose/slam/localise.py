@@ -1,0 +1,234 @@
+"""Where the camera is at the next frame: predicted, searched for if that may be far off, and tracked."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, PRNGKeyArray
+
+from jaxpose import se3
+from jaxpose.metrics import nearest_rotation
+from jaxpose.recording import Frame
+from jaxpose.slam.config import SlamConfig
+from jaxpose.slam.frames import gauge
+from jaxpose.slam.keyframes import look
+from jaxpose.slam.observe import Image
+from jaxpose.slam.predict import (
+    BEHIND,
+    Interval,
+    Readings,
+    end_velocity,
+    observe_acceleration,
+    predict,
+    prediction_sigma,
+)
+from jaxpose.slam.search import CENTRES, FOUND_SIGMA
+from jaxpose.slam.state import Frames, SlamState
+from jaxpose.slam.system import System
+from jaxpose.slam.track import Tracked
+from jaxpose.slam.world import scene_params
+
+_FAR_OFF = 0.08  # [m, rad] a prediction that may be off by more is searched around
+_FARTHEST = 0.5  # [m, rad]
+_AROUND_KEYFRAMES = 0.2  # [m, rad]
+_LEAST_DEPTH = 0.01  # share of an image
+_FADING_S = 0.5  # in which a speed that nothing senses is forgotten
+
+
+def next_pose(
+    system: System,
+    state: SlamState,
+    frame: Frame,
+    image: Image,
+    generator: np.random.Generator,
+    key: PRNGKeyArray,
+) -> SlamState:
+    """The state with the next frame's pose: tracked, or predicted and marked as lost."""
+    config, t, i = system.config, system.recording.t, state.done
+    dt = float(t[i] - t[i - 1])
+    readings = system.readings(i - 1, state.frames.T_world_body[i - 1], state.false_acceleration)
+    stamps, poses = predict(
+        dt, state.twist, state.velocity_body, readings,
+        rotation=config.senses_rotation, speed=config.senses_speed,
+    )  # fmt: skip
+    predicted, sigma = poses[-1], _sigma(config, dt, poses[-1], first=i == 1)
+    reach = _reach(system, state, sigma, dt)
+    frames, tracked, lost = state.frames, None, True
+    if np.mean(frame.depth > 0) >= _LEAST_DEPTH:
+        for wide in (True,) if max(reach) > _FAR_OFF else (False, True):
+            if wide:
+                frames, T_ref_body = _searched(system, state, frame, image, predicted, reach, key)
+                twist = np.asarray(se3.log(jnp.asarray(T_ref_body, jnp.float32)))
+                stamps = dt * np.arange(1, len(stamps) + 1) / len(stamps)
+                poses = np.asarray(
+                    se3.exp(jnp.asarray(stamps[:, None] / dt * twist, jnp.float32)), np.float64
+                )
+                sigma = np.minimum(sigma, FOUND_SIGMA)
+            interval = _interval(system, frames, i - 1, dt, stamps, poses, sigma, readings)
+            tracked = _track(system, state, frames, interval, image, generator, key)
+            lost = _failed(tracked, frames.loss[1:i][~frames.lost[1:i]], config)
+            if not lost:
+                break
+    return _moved(system, state, frames, dt, readings, predicted, tracked, lost)
+
+
+def _moved(
+    system: System,
+    state: SlamState,
+    frames: Frames,
+    dt: float,
+    readings: Readings,
+    predicted: Float[np.ndarray, "4 4"],
+    tracked: Tracked | None,
+    lost: bool,
+) -> SlamState:
+    """The state after an interval: with the tracked motion, or with the predicted one where that is lost."""
+    config, i = system.config, state.done
+    if tracked is None or lost:
+        frames, T_ref_body, params = state.frames, predicted, state.params
+    else:
+        T_ref_body, params = np.asarray(tracked.T_ref_body, np.float64), tracked.params
+    T_world_ref = frames.T_world_body[i - 1]
+    T_world_body = T_world_ref @ T_ref_body
+    T_world_body[:3, :3] = nearest_rotation(T_world_body[:3, :3])  # float32 adds up
+    false_acceleration = state.false_acceleration
+    if i > 1 and not lost and not frames.lost[i - 1] and config.senses_speed:  # else the speed is not known
+        error = T_world_ref[:3, :3] @ (T_ref_body[:3, 3] - predicted[:3, 3])
+        false_acceleration = observe_acceleration(false_acceleration, dt, error)
+    frames = frames.put(i, T_world_body=T_world_body, lost=lost)
+    if tracked is not None:
+        frames = frames.put(
+            i,
+            iterations=tracked.iterations,
+            loss=tracked.loss,
+            depth_error=tracked.depth_error,
+            valid=tracked.valid,
+            sigma=tracked.sigma,
+        )
+    fade = np.exp(-dt / _FADING_S) if lost else 1.0
+    velocity_body = end_velocity(dt, T_ref_body, readings, speed=config.senses_speed)
+    return state._replace(
+        frames=frames,
+        twist=fade * np.asarray(se3.log(jnp.asarray(T_ref_body, jnp.float32)), np.float64) / dt,
+        velocity_body=velocity_body if config.senses_speed else fade * velocity_body,
+        false_acceleration=false_acceleration,
+        params=params,
+    )
+
+
+def _sigma(config: SlamConfig, dt: float, predicted: Float[np.ndarray, "4 4"], *, first: bool):
+    """How far off [m, rad] a predicted motion may be."""
+    # Without two frames the speed is not known, and the accelerometer only changes it.
+    speed = config.senses_speed and not first
+    sigma = prediction_sigma(dt, predicted, rotation=config.senses_rotation, speed=speed)
+    if first:
+        sigma = sigma + [0.3 * dt, 0.0 if config.senses_rotation else 0.3 * dt]  # as fast as a hand may move
+    return sigma
+
+
+def _reach(system: System, state: SlamState, sigma: np.ndarray, dt: float) -> np.ndarray:
+    """How far [m, rad] to search: what a hand's change of speed adds, and the time since a pose was found."""
+    config, t, i = system.config, system.recording.t, state.done
+    blind = t[i - 1] - t[_last_found(state.frames, i)]
+    metres = 0.1 * blind + 0.05 * blind**2 if config.senses_speed else 0.25 * dt**2 + 0.3 * blind
+    radians = 0.01 * blind if config.senses_rotation else 0.5 * dt**2 + 0.3 * blind
+    return np.minimum(sigma + [metres, radians], _FARTHEST)
+
+
+def _last_found(frames: Frames, i: int) -> int:
+    """The last frame before i that was not lost."""
+    return int(np.flatnonzero(~frames.lost[:i])[-1])
+
+
+def _searched(
+    system: System,
+    state: SlamState,
+    frame: Frame,
+    image: Image,
+    predicted: Float[np.ndarray, "4 4"],
+    reach: np.ndarray,
+    key: PRNGKeyArray,
+) -> tuple[Frames, Float[np.ndarray, "4 4"]]:
+    """The motion that a wide search finds, lost frames bent to lead there.
+
+    After a loss, poses of keyframes that look alike are searched around too.
+    """
+    T_body_cam, frames, i = system.recording.T_body_cam, state.frames, state.done
+    T_world_predicted = frames.T_world_body[i - 1] @ predicted
+    last = _last_found(frames, i)
+    centres = [T_world_predicted @ T_body_cam]
+    if last < i - 1:
+        kept = np.flatnonzero(frames.keyframe)
+        unlike = np.array([np.mean((system.look(k) - look(frame)) ** 2) for k in kept.tolist()])
+        alike = kept[np.argsort(unlike)[: CENTRES - 2]]
+        centres += [frames.T_world_body[k] @ T_body_cam for k in [last, *alike]]
+        reach = np.maximum(reach, _AROUND_KEYFRAMES)
+    found, score = system.world(state.grid).search(
+        scene_params(state.map),
+        jnp.asarray(np.resize(centres, (CENTRES, 4, 4)), jnp.float32),
+        jnp.asarray(reach, jnp.float32),
+        image,
+        jax.random.fold_in(key, 1),
+    )
+    T_world_body = np.asarray(found, np.float64) @ np.linalg.inv(T_body_cam)
+    frames = _bent(frames, system.recording.t, last, i, np.linalg.inv(T_world_predicted) @ T_world_body)
+    return frames, np.linalg.inv(frames.T_world_body[i - 1]) @ T_world_body
+
+
+def _bent(frames: Frames, t: np.ndarray, last: int, i: int, T_predicted_found: np.ndarray) -> Frames:
+    """The frames lost between `last` and i moved by their share of what the prediction at i was off."""
+    lost = np.arange(last + 1, i)
+    share = (t[lost] - t[last]) / (t[i] - t[last])
+    off = np.asarray(se3.log(jnp.asarray(T_predicted_found, jnp.float32)), np.float64)
+    correction = np.asarray(se3.exp(jnp.asarray(share[:, None] * off, jnp.float32)), np.float64)
+    return frames.put(lost, T_world_body=frames.T_world_body[lost] @ correction)
+
+
+def _interval(
+    system: System,
+    frames: Frames,
+    last: int,
+    dt: float,
+    stamps: np.ndarray,
+    poses: np.ndarray,
+    sigma: np.ndarray,
+    readings: Readings,
+) -> Interval:
+    """What tracking the next frame starts from."""
+    t, T_world_body = system.recording.t, frames.T_world_body
+    behind = [max(last - k, 0) for k in range(BEHIND + 1)]  # the last frame itself, and those before
+    past = np.linalg.inv(T_world_body[last]) @ T_world_body[behind]
+    as_float = lambda x: jnp.asarray(x, jnp.float32)
+    return Interval(
+        as_float(dt),
+        as_float(np.concatenate([stamps, t[behind] - t[last]])),
+        as_float(np.concatenate([poses, past])),
+        as_float(sigma),
+        readings,
+    )
+
+
+def _track(
+    system: System,
+    state: SlamState,
+    frames: Frames,
+    interval: Interval,
+    image: Image,
+    generator: np.random.Generator,
+    key: PRNGKeyArray,
+) -> Tracked:
+    config, t, last = system.config, system.recording.t, state.done - 1
+    T_world_ref, T_world_first = frames.T_world_body[last], frames.T_world_body[0]
+    where = gauge(config.frame, float(t[last] - t[0]), T_world_ref, T_world_first, generator)
+    return jax.device_get(
+        system.world(state.grid).track(
+            scene_params(state.map), state.params, jnp.asarray(T_world_ref, jnp.float32), where, interval,
+            image, jnp.float32(state.far), key,
+        )
+    )  # fmt: skip
+
+
+def _failed(tracked: Tracked, losses: Float[np.ndarray, " k"], config: SlamConfig) -> bool:
+    """Whether tracking went wrong: too little of the image explained, or far worse than it usually is."""
+    usual = float(np.median(losses[-30:])) if len(losses) else np.inf
+    explained = np.isfinite(tracked.loss) and tracked.valid >= config.track.minimum_valid
+    return not (explained and tracked.loss < 2 * usual)

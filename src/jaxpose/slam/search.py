@@ -1,0 +1,70 @@
+"""A wide search for a camera's pose: many candidates, each judged by where a few points fall in the map.
+
+For what second-order steps cannot reach: long intervals without an IMU, and frames after a loss.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from jaxpose import se3
+from jaxpose.render import Query
+from jaxpose.slam.observe import Pixels, back_project
+
+FOUND_SIGMA = (0.04, 0.03)  # [m, rad] how far off the pose that a search finds may be
+
+_CANDIDATES = 512
+CENTRES = 32  # kept from round to round
+_ROUNDS = 5
+_NARROWER = 0.5  # the spread of a round's candidates against that of the one before
+_COLOUR = 0.5  # what a wrong colour costs, against a point that is nowhere near a surface
+_COLOUR_SCALE = 0.3
+
+
+def search(
+    query: Query,
+    T_world_cam: Float[Array, "k 4 4"],
+    sigma: Float[Array, "2"],
+    pixels: Pixels,
+    band: float,
+    key: PRNGKeyArray,
+) -> tuple[Float[Array, "4 4"], Float[Array, ""]]:
+    """The pose among those within a few `sigma` [m, rad] of any of `T_world_cam`, and its score (0 to 1.5).
+
+    Rounds of random candidates around the best of the round before, each closer than the last. Measured
+    points are to lie on the map's zero; `band` [m] is the largest distance that the map knows.
+    """
+
+    def score(T):
+        return mismatch(query, T, pixels, band)
+
+    def improve(carry, at):
+        best, scores = carry
+        spread, key = at
+        centres = jnp.concatenate([best] * (_CANDIDATES // CENTRES))
+        xi = jax.random.normal(key, (centres.shape[0], 6)) * spread * jnp.repeat(sigma, 3)[None]
+        tries = se3.compose(centres, se3.exp(xi))
+        tried = jax.lax.map(score, tries, batch_size=64)
+        return _best(jnp.concatenate([best, tries]), jnp.concatenate([scores, tried])), None
+
+    first = T_world_cam
+    keys = jax.random.split(key, _ROUNDS)
+    start = first, jax.lax.map(score, first, batch_size=CENTRES)
+    (best, scores), _ = jax.lax.scan(improve, start, (_NARROWER ** jnp.arange(_ROUNDS), keys))
+    return best[0], scores[0]
+
+
+def mismatch(query: Query, T_world_cam: Float[Array, "4 4"], pixels: Pixels, band: float) -> Float[Array, ""]:
+    """How badly measured points fit the map: distance and colour, 0 to 1.5, a mean over pixels with depth."""
+    points = back_project(pixels, T_world_cam)
+    distance, rgb = jax.vmap(query)(points, pixels.direction_cam)
+    near = jnp.abs(distance) / band
+    colour = jnp.mean(jnp.abs(rgb - pixels.rgb), axis=-1) / _COLOUR_SCALE
+    cost = jnp.where(near < 0.99, near + _COLOUR * jnp.minimum(colour, 1), 1 + _COLOUR)
+    seen = (pixels.depth > 0).astype(cost.dtype)
+    return jnp.sum(cost * seen) / jnp.maximum(jnp.sum(seen), 1)
+
+
+def _best(poses: Float[Array, "n 4 4"], scores: Float[Array, " n"]):
+    lowest, index = jax.lax.top_k(-scores, CENTRES)
+    return poses[index], -lowest
