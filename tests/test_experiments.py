@@ -27,7 +27,7 @@ FRAMES = 8
 PICTURES = {"trajectory.png", "errors.png", "renders.png"}
 FILES = PICTURES | {
     "config.json", "results.json", "trajectory.txt", "reference.txt", "field.npz", "camera.json",
-    "mesh.ply", "points.ply",
+    "mesh.ply", "points.ply", "preview.png", "settings.json",
 }  # fmt: skip
 
 
@@ -148,13 +148,14 @@ def test_rgbd_slam_on_a_folder(folder, tmp_path, capsys):
 def test_compare_runs_every_mode(finished, tmp_path, monkeypatch, recording):
     modes = []
 
-    def quick(used, config, on_frame):
+    def quick(used, config, on_frame, state):
         modes.append(config.imu)
         field, params = slam_run.load_field(finished.folder)
         poses = io.read_tum(finished.folder / "trajectory.txt").T
         return slam_run.SlamResult(
-            poses, np.zeros(FRAMES, bool), np.ones(FRAMES, bool), np.ones(FRAMES, int),
-            *np.ones((4, FRAMES)), *[None] * 3, [], field, params, 0.0, 0.0,
+            poses, *np.zeros((2, FRAMES), bool), np.ones(FRAMES, bool), np.ones(FRAMES, int),
+            *np.ones((3, FRAMES)), np.ones((FRAMES, 2)), np.ones(FRAMES), *[None] * 3,
+            np.zeros(0, int), field, params, 0.0, 0.0,
         )  # fmt: skip
 
     monkeypatch.setattr(slam_run, "track", quick)

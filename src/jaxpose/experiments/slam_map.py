@@ -1,7 +1,7 @@
 """A map seen from the frames' estimated poses: pictures of it, and how well it shows what was measured."""
 
 from collections.abc import Callable
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -12,6 +12,8 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 from jaxpose import metrics
 from jaxpose.plots import View
 from jaxpose.recording import Recording
+from jaxpose.scenes import GridConfig, grid
+from jaxpose.scenes.base import Params
 from jaxpose.slam.observe import Image, Pixels, SampleConfig, read_pixels, render_pixels
 from jaxpose.slam.run import SlamResult
 
@@ -75,22 +77,58 @@ def _quality(render: Renderer, chosen: Bool[np.ndarray, " n"]) -> dict[str, Any]
 
 
 def renderer(recording: Recording, result: SlamResult) -> Renderer:
-    """The frame with a given index, and the map as seen from its estimated pose.
+    """The frame with a given index, and the map as seen from its estimated pose."""
+    return lambda i: render_frame(recording, i, result.T_world_cam[i], result.grid, result.scene_params)
+
+
+def render_frame(
+    recording: Recording,
+    i: int,
+    T_world_cam: Float[np.ndarray, "4 4"],
+    size: GridConfig,
+    scene_params: Params,
+    width: int = _VIEW_WIDTH,
+) -> Rendered:
+    """A frame and the map as seen from a pose, about `width` pixels wide.
 
     The measured depth plays no part in the rendering: a first pass over evenly spaced samples finds the
     surface, a second one looks closely.
     """
-    grid, camera = result.grid, recording.camera
-    step = max(1, round(camera.width / _VIEW_WIDTH))
+    camera = recording.camera
+    step = max(1, round(camera.width / width))
     row, column = np.mgrid[step // 2 : camera.height : step, step // 2 : camera.width : step]
-    fine = SampleConfig(band=grid.truncation, width=grid.truncation / 8)
-    reach = float(np.linalg.norm(np.subtract(grid.upper, grid.lower)))
-    evenly = int(np.clip(reach / grid.truncation * 4, 64, 256))
-    coarse = SampleConfig(front=evenly, surface=0, behind=0, band=grid.truncation, width=grid.truncation / 4)
+    frame = recording.read(i)
+    image = Image(jnp.asarray(frame.rgb), jnp.asarray(frame.depth, jnp.float32))
+    pose = jnp.asarray(T_world_cam, jnp.float32)
+    render, count = _compiled(size), row.size
+    padded = np.arange(-(-count // _CHUNK) * _CHUNK) % count  # whole chunks: one shape is compiled
+    parts = []
+    for chunk in padded.reshape(-1, _CHUNK):
+        pixels = read_pixels(image, camera, jnp.asarray(row.flat[chunk]), jnp.asarray(column.flat[chunk]))
+        parts.append(jax.device_get(render(scene_params, pose, pixels)))
+    rgb, depth = (np.concatenate(x)[:count] for x in zip(*parts, strict=True))
+    photograph = np.asarray(frame.rgb)
+    return Rendered(
+        photograph,
+        photograph[row, column] / 255,
+        np.asarray(frame.depth)[row, column],
+        rgb.reshape(*row.shape, 3),
+        depth.reshape(row.shape),
+    )
+
+
+@lru_cache(maxsize=1)
+def _compiled(size: GridConfig):
+    """The rendering of pixels with a map of this size."""
+    scene = grid(size)
+    fine = SampleConfig(band=size.truncation, width=size.truncation / 8)
+    reach = float(np.linalg.norm(np.subtract(size.upper, size.lower)))
+    evenly = int(np.clip(reach / size.truncation * 4, 64, 256))
+    coarse = SampleConfig(front=evenly, surface=0, behind=0, band=size.truncation, width=size.truncation / 4)
 
     @jax.jit
     def render(params, T_world_cam: Float[Array, "4 4"], pixels: Pixels):
-        query, far = partial(result.scene.query, params), jnp.float32(reach)
+        query, far = partial(scene.query, params), jnp.float32(reach)
         unknown = pixels._replace(depth=jnp.zeros_like(pixels.depth))
         found = render_pixels(query, T_world_cam, unknown, far, coarse)
         surface = jnp.where(found.opacity > 0.5, found.depth, 0)
@@ -98,27 +136,7 @@ def renderer(recording: Recording, result: SlamResult) -> Renderer:
         there = (surface > 0) & (seen.opacity > 0.5)
         return jnp.where(there[:, None], seen.rgb, 0.86), jnp.where(there, seen.depth, 0)
 
-    def at(i: int) -> Rendered:
-        frame = recording.read(i)
-        image = Image(jnp.asarray(frame.rgb), jnp.asarray(frame.depth, jnp.float32))
-        pose = jnp.asarray(result.T_world_cam[i], jnp.float32)
-        count = row.size
-        padded = np.arange(-(-count // _CHUNK) * _CHUNK) % count  # whole chunks: one shape is compiled
-        parts = []
-        for chunk in padded.reshape(-1, _CHUNK):
-            pixels = read_pixels(image, camera, jnp.asarray(row.flat[chunk]), jnp.asarray(column.flat[chunk]))
-            parts.append(jax.device_get(render(result.scene_params, pose, pixels)))
-        rgb, depth = (np.concatenate(x)[:count] for x in zip(*parts, strict=True))
-        photograph = np.asarray(frame.rgb)
-        return Rendered(
-            photograph,
-            photograph[row, column] / 255,
-            np.asarray(frame.depth)[row, column],
-            rgb.reshape(*row.shape, 3),
-            depth.reshape(row.shape),
-        )
-
-    return at
+    return render
 
 
 def _evenly(indices: Int[np.ndarray, " n"], most: int) -> list[int]:

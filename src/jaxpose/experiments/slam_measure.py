@@ -45,6 +45,9 @@ def cost(result: SlamResult) -> dict[str, Any]:
         "frames": len(result.lost),
         "frames_lost": int(result.lost.sum()),
         "lost": np.flatnonzero(result.lost),
+        "frames_uncertain": int(result.uncertain.sum()),
+        "uncertain": np.flatnonzero(result.uncertain),
+        "pose_sigma_median": _medians(result.sigma),
         "seconds_per_frame": float(np.median(settled)),
         "seconds_per_frame_mean_with_compilation": float(result.seconds.mean()),
         "iterations_mean": float(result.iterations[1:].mean()),
@@ -53,6 +56,13 @@ def cost(result: SlamResult) -> dict[str, Any]:
         "field_rmse_m": result.field_rmse_m,
         "field_rmse_deg": result.field_rmse_deg,
     }
+
+
+def _medians(sigma: Float[np.ndarray, "n 2"]) -> dict[str, float]:
+    """Medians over the frames of which something is known, NaN without any."""
+    known = sigma[np.isfinite(sigma).all(axis=1)]
+    metres, radians = np.median(known, axis=0) if len(known) else (np.nan, np.nan)
+    return {"translation_m": float(metres), "rotation_deg": float(np.rad2deg(radians))}
 
 
 def accuracy(

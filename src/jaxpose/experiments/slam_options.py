@@ -1,6 +1,8 @@
 """Options that the SLAM experiments share, and the recording they name."""
 
+import json
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
@@ -9,6 +11,7 @@ import jax
 import numpy as np
 import tyro
 
+from jaxpose import io
 from jaxpose.data import recordings
 from jaxpose.data.synthetic import RoomConfig, room
 from jaxpose.errors import DataError
@@ -35,6 +38,7 @@ class Options:
     # How rotations pass through the true poses where an IMU is simulated from them: slerp is the paper's.
     imu_rotation: Literal["slerp", "spline"] = "slerp"
     compare: bool = False  # run all IMU modes and put them side by side
+    resume: bool = False  # go on where a run of the same folder and settings was stopped
     smoke: bool = False  # everything shrunk to seconds; the numbers then mean nothing
     out: Path | None = None  # exactly this folder; None: outputs/<experiment>/<name or time stamp>
     name: str | None = None  # of the run folder
@@ -57,6 +61,23 @@ class Options:
         if self.format == "room" and self.data is not None:
             raise ValueError(f"--format room: expected no --data, as the room is made; got {self.data}")
         _room_config(self)
+
+
+def decisive(options: Options) -> dict[str, Any]:
+    """The settings that a resumed run must share with the one it resumes, by the names of the options."""
+    return {
+        name: value
+        for name, value in _flat(json.loads(io.json_text(options)))
+        if name not in ("out", "name", "resume", "compare")
+    }
+
+
+def _flat(settings: dict[str, Any], within: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in settings.items():
+        if isinstance(value, dict):
+            yield from _flat(value, "" if name == "slam" else f"{within}{name}.")
+        else:
+            yield within + name, value
 
 
 def slam_config(options: Options) -> SlamConfig:

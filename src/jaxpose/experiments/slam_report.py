@@ -73,7 +73,11 @@ def report(folder: Path, results: dict[str, Any]) -> str:
     else:
         lines.append(_line("ATE", "no truth to compare with"))
     lines += [
-        _line("lost", f"{results['frames_lost']} of {results['frames']} frames"),
+        _line(
+            "lost",
+            f"{results['frames_lost']} of {results['frames']} frames, "
+            f"{results['frames_uncertain']} uncertain",
+        ),
         _line(
             "time per frame",
             f"{results['seconds_per_frame']:.3f} s  median after the first two, which compile; "

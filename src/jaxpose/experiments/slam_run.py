@@ -1,5 +1,6 @@
 """What the SLAM experiments do: run, measure, draw, and write the run folder."""
 
+import json
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -12,11 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxpose import io, plots
+from jaxpose import command, io, metrics, plots
 from jaxpose.errors import DataError
+from jaxpose.experiments import slam_checkpoint
+from jaxpose.experiments.slam_keep import keeper
 from jaxpose.experiments.slam_map import Renderer, map_quality, renderer, views
 from jaxpose.experiments.slam_measure import Accuracy, Inertial, accuracy, cost, inertial
-from jaxpose.experiments.slam_options import Options, Source, load, slam_config
+from jaxpose.experiments.slam_options import Options, Source, decisive, load, slam_config
 from jaxpose.experiments.slam_report import table
 from jaxpose.fields import Params, PoseField, bspline
 from jaxpose.io_camera import write_camera
@@ -27,6 +30,7 @@ from jaxpose.slam.keyframes import read_keyframes
 from jaxpose.slam.run import ImuMode, Progress, SlamResult
 from jaxpose.slam.run import run as track
 from jaxpose.slam.surface import cloud, mesh
+from jaxpose.slam.system import make_system
 
 OnFrame = Callable[[ImuMode, Progress], None]
 
@@ -102,7 +106,23 @@ def _single(
 ) -> tuple[dict[str, Any], Float[np.ndarray, " n"]]:
     """One tracked run, written: its results, and the translation error [m] of every frame."""
     recording, mode, truth = source.recording, options.slam.imu, source.recording.T_world_cam
-    result = track(recording, slam_config(options), None if on_frame is None else partial(on_frame, mode))
+    checkpoint, finished = folder / "checkpoint.npz", folder / "results.json"
+    if not command.resumes(folder, folder / "settings.json", decisive(options), options.resume):
+        checkpoint.unlink(missing_ok=True)
+        finished.unlink(missing_ok=True)
+    if finished.exists():
+        return json.loads(finished.read_text()), _written_errors(folder, recording)
+    config, state = slam_config(options), None
+    if checkpoint.exists():
+        state = slam_checkpoint.load(checkpoint, make_system(recording, config))
+    keep = keeper(folder, recording, decisive(options))
+
+    def done(progress: Progress) -> None:
+        keep(progress)
+        if on_frame is not None:
+            on_frame(mode, progress)
+
+    result = track(recording, config, done, state)
     errors = None if truth is None else accuracy(result, recording.t, truth)
     motion = inertial(recording, result)
     render = renderer(recording, result)
@@ -139,8 +159,16 @@ def _single(
         "wall_s": time.perf_counter() - started,
         "peak_rss_bytes": io.peak_rss_bytes(),
     }
-    io.write_json(folder / "results.json", results)
+    io.write_json(finished, results)  # with it the run counts as finished
+    checkpoint.unlink(missing_ok=True)
     return results, np.full(len(recording.t), np.nan) if errors is None else errors.translation_m
+
+
+def _written_errors(folder: Path, recording: Recording) -> Float[np.ndarray, " n"]:
+    """The translation errors [m] of a finished run, from its files."""
+    if recording.T_world_cam is None:
+        return np.full(len(recording.t), np.nan)
+    return metrics.ate(io.read_tum(folder / "trajectory.txt").T, recording.T_world_cam).errors
 
 
 def _write_surface(folder: Path, recording: Recording, result: SlamResult) -> tuple[str, ...]:

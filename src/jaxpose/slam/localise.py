@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from jaxpose import se3
-from jaxpose.metrics import nearest_rotation
+from jaxpose.metrics import nearest_rotation, rotation_angle_deg
 from jaxpose.recording import Frame
 from jaxpose.slam.config import SlamConfig
 from jaxpose.slam.frames import gauge
@@ -29,7 +29,10 @@ from jaxpose.slam.world import scene_params
 
 _FAR_OFF = 0.08  # [m, rad] a prediction that may be off by more is searched around
 _FARTHEST = 0.5  # [m, rad]
-_AROUND_KEYFRAMES = 0.2  # [m, rad]
+_AROUND_CENTRES = 0.25  # [m, rad] a search reaches where nothing else is known
+_RECOGNISED = 0.7, 1.1  # share explained, and loss against the usual, of a camera that could be anywhere
+_RECKONED = 0.3  # [m, rad] a pose from the IMU alone is good enough to go on from
+_SHARP = 0.02  # [m, rad] a pose known less well is uncertain
 _LEAST_DEPTH = 0.01  # share of an image
 _FADING_S = 0.5  # in which a speed that nothing senses is forgotten
 
@@ -52,22 +55,25 @@ def next_pose(
     )  # fmt: skip
     predicted, sigma = poses[-1], _sigma(config, dt, poses[-1], first=i == 1)
     reach = _reach(system, state, sigma, dt)
+    if np.mean(frame.depth > 0) < _LEAST_DEPTH:
+        return _moved(system, state, state.frames, dt, readings, predicted, None, lost=True)
     frames, tracked, lost = state.frames, None, True
-    if np.mean(frame.depth > 0) >= _LEAST_DEPTH:
-        for wide in (True,) if max(reach) > _FAR_OFF else (False, True):
-            if wide:
-                frames, T_ref_body = _searched(system, state, frame, image, predicted, reach, key)
-                twist = np.asarray(se3.log(jnp.asarray(T_ref_body, jnp.float32)))
-                stamps = dt * np.arange(1, len(stamps) + 1) / len(stamps)
-                poses = np.asarray(
-                    se3.exp(jnp.asarray(stamps[:, None] / dt * twist, jnp.float32)), np.float64
-                )
-                sigma = np.minimum(sigma, FOUND_SIGMA)
-            interval = _interval(system, frames, i - 1, dt, stamps, poses, sigma, readings)
-            tracked = _track(system, state, frames, interval, image, generator, key)
-            lost = _failed(tracked, frames.loss[1:i][~frames.lost[1:i]], config)
-            if not lost:
-                break
+    for wide in (True,) if max(reach) > _FAR_OFF else (False, True):
+        if wide:
+            frames, T_ref_body = _searched(system, state, frame, image, predicted, reach, key)
+            twist = np.asarray(se3.log(jnp.asarray(T_ref_body, jnp.float32)))
+            stamps = dt * np.arange(1, len(stamps) + 1) / len(stamps)
+            poses = np.asarray(se3.exp(jnp.asarray(stamps[:, None] / dt * twist, jnp.float32)), np.float64)
+            sigma = np.minimum(sigma, FOUND_SIGMA)
+        interval = _interval(system, frames, i - 1, dt, stamps, poses, sigma, readings)
+        tracked = _track(system, state, frames, interval, image, generator, key)
+        lost = _failed(system, state, tracked, reach)
+        if not lost:
+            break
+    assert tracked is not None
+    unknown_place = lost and tracked.valid < config.track.minimum_valid
+    if unknown_place and config.senses_speed and max(reach) < _RECKONED:
+        return _moved(system, state, state.frames, dt, readings, predicted, None, lost=False)
     return _moved(system, state, frames, dt, readings, predicted, tracked, lost)
 
 
@@ -83,7 +89,7 @@ def _moved(
 ) -> SlamState:
     """The state after an interval: with the tracked motion, or with the predicted one where that is lost."""
     config, i = system.config, state.done
-    if tracked is None or lost:
+    if tracked is None or lost:  # neither: reckoned from the IMU
         frames, T_ref_body, params = state.frames, predicted, state.params
     else:
         T_ref_body, params = np.asarray(tracked.T_ref_body, np.float64), tracked.params
@@ -91,10 +97,12 @@ def _moved(
     T_world_body = T_world_ref @ T_ref_body
     T_world_body[:3, :3] = nearest_rotation(T_world_body[:3, :3])  # float32 adds up
     false_acceleration = state.false_acceleration
-    if i > 1 and not lost and not frames.lost[i - 1] and config.senses_speed:  # else the speed is not known
+    if (
+        i > 1 and tracked is not None and not lost and not frames.lost[i - 1] and config.senses_speed
+    ):  # else the speed is not known
         error = T_world_ref[:3, :3] @ (T_ref_body[:3, 3] - predicted[:3, 3])
         false_acceleration = observe_acceleration(false_acceleration, dt, error)
-    frames = frames.put(i, T_world_body=T_world_body, lost=lost)
+    frames = frames.put(i, T_world_body=T_world_body, lost=lost, uncertain=_uncertain(tracked, lost))
     if tracked is not None:
         frames = frames.put(
             i,
@@ -115,6 +123,11 @@ def _moved(
     )
 
 
+def _uncertain(tracked: Tracked | None, lost: bool) -> bool:
+    """Whether a pose rests on a prediction, or on an image that says little of it."""
+    return tracked is None or lost or bool((np.asarray(tracked.sigma) > _SHARP).any())
+
+
 def _sigma(config: SlamConfig, dt: float, predicted: Float[np.ndarray, "4 4"], *, first: bool):
     """How far off [m, rad] a predicted motion may be."""
     # Without two frames the speed is not known, and the accelerometer only changes it.
@@ -126,12 +139,16 @@ def _sigma(config: SlamConfig, dt: float, predicted: Float[np.ndarray, "4 4"], *
 
 
 def _reach(system: System, state: SlamState, sigma: np.ndarray, dt: float) -> np.ndarray:
-    """How far [m, rad] to search: what a hand's change of speed adds, and the time since a pose was found."""
+    """How far [m, rad] to search: what a hand's change of speed adds, and the time since a pose was found.
+
+    Infinite where nothing is known any more.
+    """
     config, t, i = system.config, system.recording.t, state.done
     blind = t[i - 1] - t[_last_found(state.frames, i)]
-    metres = 0.1 * blind + 0.05 * blind**2 if config.senses_speed else 0.25 * dt**2 + 0.3 * blind
-    radians = 0.01 * blind if config.senses_rotation else 0.5 * dt**2 + 0.3 * blind
-    return np.minimum(sigma + [metres, radians], _FARTHEST)
+    metres = 0.05 * blind + 0.02 * blind**2 if config.senses_speed else 0.25 * dt**2 + 0.3 * blind
+    radians = 0.005 * blind if config.senses_rotation else 0.5 * dt**2 + 0.3 * blind
+    reach = sigma + [metres, radians]
+    return np.where(reach < _FARTHEST, reach, np.inf)
 
 
 def _last_found(frames: Frames, i: int) -> int:
@@ -150,22 +167,25 @@ def _searched(
 ) -> tuple[Frames, Float[np.ndarray, "4 4"]]:
     """The motion that a wide search finds, lost frames bent to lead there.
 
-    After a loss, poses of keyframes that look alike are searched around too.
+    After a loss, poses of keyframes within reach that look alike are searched around too.
     """
     T_body_cam, frames, i = system.recording.T_body_cam, state.frames, state.done
     T_world_predicted = frames.T_world_body[i - 1] @ predicted
     last = _last_found(frames, i)
-    centres = [T_world_predicted @ T_body_cam]
+    centres = [T_world_predicted]
     if last < i - 1:
-        kept = np.flatnonzero(frames.keyframe)
-        unlike = np.array([np.mean((system.look(k) - look(frame)) ** 2) for k in kept.tolist()])
-        alike = kept[np.argsort(unlike)[: CENTRES - 2]]
-        centres += [frames.T_world_body[k] @ T_body_cam for k in [last, *alike]]
-        reach = np.maximum(reach, _AROUND_KEYFRAMES)
-    found, score = system.world(state.grid).search(
+        kept = np.append(np.flatnonzero(frames.keyframe), last)
+        away = np.linalg.inv(T_world_predicted) @ frames.T_world_body[kept]
+        angle = rotation_angle_deg(away[:, :3, :3], np.eye(3)[None])
+        off = np.stack([np.linalg.norm(away[:, :3, 3], axis=1), np.deg2rad(angle)], axis=1)
+        kept = kept[(off <= 3 * reach).all(axis=1)]
+        unlike = [np.mean((system.look(k) - look(frame)) ** 2) for k in kept.tolist()]
+        centres += list(frames.T_world_body[kept[np.argsort(unlike)[: CENTRES - 1]]])
+    spread = np.where(np.isfinite(reach), reach, _AROUND_CENTRES)
+    found = system.world(state.grid).search(
         scene_params(state.map),
-        jnp.asarray(np.resize(centres, (CENTRES, 4, 4)), jnp.float32),
-        jnp.asarray(reach, jnp.float32),
+        jnp.asarray(np.resize(centres, (CENTRES, 4, 4)) @ T_body_cam, jnp.float32),
+        jnp.asarray(spread, jnp.float32),
         image,
         jax.random.fold_in(key, 1),
     )
@@ -227,8 +247,16 @@ def _track(
     )  # fmt: skip
 
 
-def _failed(tracked: Tracked, losses: Float[np.ndarray, " k"], config: SlamConfig) -> bool:
-    """Whether tracking went wrong: too little of the image explained, or far worse than it usually is."""
-    usual = float(np.median(losses[-30:])) if len(losses) else np.inf
-    explained = np.isfinite(tracked.loss) and tracked.valid >= config.track.minimum_valid
-    return not (explained and tracked.loss < 2 * usual)
+def _failed(system: System, state: SlamState, tracked: Tracked, reach: np.ndarray) -> bool:
+    """Whether tracking went wrong: too little of the image explained, or far worse than it usually is.
+
+    After a loss more is asked for: a wrong place may look right, and would be mapped.
+    """
+    frames, i = state.frames, state.done
+    losses = frames.loss[1:i][~frames.lost[1:i]][-30:]
+    usual = float(np.median(losses)) if len(losses) else np.inf
+    least, most = system.config.track.minimum_valid, 2.0
+    if frames.lost[max(i - 2, 0) : i].any():
+        least, most = (least, 1.3) if np.isfinite(reach).all() else _RECOGNISED
+    explained = np.isfinite(tracked.loss) and tracked.valid >= least
+    return not (explained and tracked.loss < most * usual)

@@ -23,6 +23,7 @@ from jaxpose.slam.world import first_grid, map_frame, room_for, scene_params, se
 __all__ = ["ImuMode", "Progress", "SlamConfig", "SlamResult", "run"]
 
 _DEFAULT = SlamConfig()
+_BLANK = 3.0  # [grey levels] spread of an image that is black or saturated
 
 
 class Progress(NamedTuple):
@@ -39,11 +40,13 @@ class SlamResult(NamedTuple):
 
     T_world_cam: np.ndarray  # (n, 4, 4)
     lost: np.ndarray  # (n,) bool: tracking failed, the pose is the prediction
+    uncertain: np.ndarray  # (n,) bool: lost, reckoned from the IMU, or little in the image to hold on to
     mapped: np.ndarray  # (n,) bool: the map was made from it
     iterations: np.ndarray  # (n,)
     loss: np.ndarray  # (n,)
     depth_error: np.ndarray  # (n,) [m] median
     valid: np.ndarray  # (n,)
+    sigma: np.ndarray  # (n, 2) [m, rad] of the pose, by what the image says of it
     seconds: np.ndarray  # (n,) wall time, compilation included
     scene: SceneField
     grid: GridConfig
@@ -109,7 +112,7 @@ def step(system: System, state: SlamState, frame: Frame) -> SlamState:
     state = state._replace(done=i + 1, key=key)
     T_world_cam = state.frames.T_world_body[i] @ recording.T_body_cam
     points = seen_points(frame, recording, T_world_cam)
-    if state.frames.lost[i] or len(points) == 0 or not _due(system, state):
+    if len(points) == 0 or not _due(system, state, frame):
         return state
     away = np.linalg.norm(points - T_world_cam[:3, 3], axis=1)
     state = state._replace(far=max(state.far, 1.2 * float(np.percentile(away, 99))))
@@ -117,12 +120,17 @@ def step(system: System, state: SlamState, frame: Frame) -> SlamState:
     return map_frame(system.world(state.grid), recording, config, state, image, points, generator, map_key)
 
 
-def _due(system: System, state: SlamState) -> bool:
-    """Whether the last frame is to be mapped."""
-    config, t, i = system.config, system.recording.t, state.done - 1
+def _due(system: System, state: SlamState, frame: Frame) -> bool:
+    """Whether the last frame is to be mapped: not where its pose or its colour is in doubt."""
+    config, frames, i = system.config, state.frames, state.done - 1
     held_out = config.hold_out > 0 and i % config.hold_out == config.hold_out - 1
-    mapped = np.flatnonzero(state.frames.mapped)
-    return not held_out and (len(mapped) == 0 or t[i] - t[mapped[-1]] >= config.map_every_s)
+    mapped = np.flatnonzero(frames.mapped)
+    if held_out or frames.lost[i] or not len(mapped):
+        return not held_out and not frames.lost[i]
+    unconfirmed = frames.lost[i - 1] and not config.senses_speed
+    blank = frame.rgb[::4, ::4].std() < _BLANK
+    passed = system.recording.t[i] - system.recording.t[mapped[-1]]
+    return not unconfirmed and not blank and passed >= config.map_every_s
 
 
 def _first_pose(recording: Recording) -> Float[np.ndarray, "4 4"]:
@@ -158,11 +166,13 @@ def _finish(system: System, state: SlamState) -> SlamResult:
     return SlamResult(
         T_world_cam,
         lost=frames.lost,
+        uncertain=frames.uncertain,
         mapped=frames.mapped,
         iterations=frames.iterations,
         loss=frames.loss,
         depth_error=frames.depth_error,
         valid=frames.valid,
+        sigma=frames.sigma,
         seconds=frames.seconds,
         scene=system.world(state.grid).scene,
         grid=state.grid,

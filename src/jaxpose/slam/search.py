@@ -19,6 +19,7 @@ _ROUNDS = 5
 _NARROWER = 0.5  # the spread of a round's candidates against that of the one before
 _COLOUR = 0.5  # what a wrong colour costs, against a point that is nowhere near a surface
 _COLOUR_SCALE = 0.3
+_PRIOR = 0.02  # what a sigma along one axis costs
 
 
 def search(
@@ -28,21 +29,24 @@ def search(
     pixels: Pixels,
     band: float,
     key: PRNGKeyArray,
-) -> tuple[Float[Array, "4 4"], Float[Array, ""]]:
-    """The pose among those within a few `sigma` [m, rad] of any of `T_world_cam`, and its score (0 to 1.5).
+) -> Float[Array, "4 4"]:
+    """The pose among those within a few `sigma` [m, rad] of any of `T_world_cam`.
 
     Rounds of random candidates around the best of the round before, each closer than the last. Measured
-    points are to lie on the map's zero; `band` [m] is the largest distance that the map knows.
+    points are to lie on the map's zero, and the pose near the closest of `T_world_cam`; `band` [m] is the
+    largest distance that the map knows.
     """
+    axes = jnp.repeat(sigma, 3)
 
     def score(T):
-        return mismatch(query, T, pixels, band)
+        away = se3.log(se3.compose(se3.inverse(T_world_cam), T[None])) / axes[None]
+        return mismatch(query, T, pixels, band) + _PRIOR * jnp.min(jnp.sum(away**2, axis=-1))
 
     def improve(carry, at):
         best, scores = carry
         spread, key = at
         centres = jnp.concatenate([best] * (_CANDIDATES // CENTRES))
-        xi = jax.random.normal(key, (centres.shape[0], 6)) * spread * jnp.repeat(sigma, 3)[None]
+        xi = jax.random.normal(key, (centres.shape[0], 6)) * spread * axes[None]
         tries = se3.compose(centres, se3.exp(xi))
         tried = jax.lax.map(score, tries, batch_size=64)
         return _best(jnp.concatenate([best, tries]), jnp.concatenate([scores, tried])), None
@@ -50,8 +54,8 @@ def search(
     first = T_world_cam
     keys = jax.random.split(key, _ROUNDS)
     start = first, jax.lax.map(score, first, batch_size=CENTRES)
-    (best, scores), _ = jax.lax.scan(improve, start, (_NARROWER ** jnp.arange(_ROUNDS), keys))
-    return best[0], scores[0]
+    (best, _), _ = jax.lax.scan(improve, start, (_NARROWER ** jnp.arange(_ROUNDS), keys))
+    return best[0]
 
 
 def mismatch(query: Query, T_world_cam: Float[Array, "4 4"], pixels: Pixels, band: float) -> Float[Array, ""]:

@@ -15,6 +15,7 @@ class Frames(NamedTuple):
 
     T_world_body: Float[np.ndarray, "n 4 4"]
     lost: Bool[np.ndarray, " n"]  # tracking failed, the pose is the prediction
+    uncertain: Bool[np.ndarray, " n"]  # lost, reckoned from the IMU, or little in the image to hold on to
     mapped: Bool[np.ndarray, " n"]  # the map was made from it
     keyframe: Bool[np.ndarray, " n"]
     iterations: Int[np.ndarray, " n"]
@@ -51,14 +52,15 @@ def no_frames(count: int) -> Frames:
     """Frames of which nothing is known yet."""
     unknown, no = np.full(count, np.nan), np.zeros(count, bool)
     return Frames(
-        np.full((count, 4, 4), np.nan),
-        no,
-        no,
-        no,
-        np.zeros(count, int),
-        unknown,
-        unknown,
-        unknown,
-        np.full((count, 2), np.nan),
-        unknown,
+        T_world_body=np.full((count, 4, 4), np.nan),
+        lost=no,
+        uncertain=no,
+        mapped=no,
+        keyframe=no,
+        iterations=np.zeros(count, int),
+        loss=unknown,
+        depth_error=unknown,
+        valid=unknown,
+        sigma=np.full((count, 2), np.nan),
+        seconds=unknown,
     )

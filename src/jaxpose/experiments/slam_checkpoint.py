@@ -1,0 +1,53 @@
+"""A SLAM run on disk while it goes: its state, to go on from after a kill."""
+
+import zipfile
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxpose import io_checkpoint
+from jaxpose.errors import DataError
+from jaxpose.scenes import GridConfig
+from jaxpose.slam.run import begin
+from jaxpose.slam.state import SlamState
+from jaxpose.slam.system import System
+
+
+class _Box(NamedTuple):
+    """A grid's size as arrays."""
+
+    lower: np.ndarray
+    upper: np.ndarray
+    voxel: np.ndarray
+    levels: np.ndarray
+    truncation: np.ndarray
+
+
+def save(path: Path | str, state: SlamState) -> None:
+    """Write a run's state, whole or not at all."""
+    size = state.grid
+    box = _Box(*(np.asarray(getattr(size, name)) for name in _Box._fields))
+    io_checkpoint.save(path, state._replace(done=np.asarray(state.done), far=np.asarray(state.far), grid=box))
+
+
+def load(path: Path | str, system: System) -> SlamState:
+    """Read what `save` wrote of a run of this recording and these settings.
+
+    DataError naming the file if it is damaged or of another run.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            box = _Box(*(file[f".grid.{name}"] for name in _Box._fields))
+    except (zipfile.BadZipFile, ValueError, EOFError, KeyError) as error:
+        raise DataError(f"{path}: expected a checkpoint, got {' '.join(str(error).split())}") from None
+    size = GridConfig(
+        tuple(box.lower.tolist()),
+        tuple(box.upper.tolist()),
+        float(box.voxel),
+        int(box.levels),
+        float(box.truncation),
+    )
+    like = begin(system, size)._replace(done=np.asarray(0), far=np.asarray(0.0), grid=box)
+    state = io_checkpoint.load(path, like)
+    return state._replace(done=int(state.done), far=float(state.far), grid=size)

@@ -1,0 +1,51 @@
+"""What a SLAM run leaves in its folder while it goes: a checkpoint and a preview."""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from jaxpose import io
+from jaxpose.experiments import slam_checkpoint
+from jaxpose.experiments.slam_map import render_frame
+from jaxpose.plots import View
+from jaxpose.plots_preview import preview
+from jaxpose.recording import Recording
+from jaxpose.slam.run import Progress
+from jaxpose.slam.state import SlamState
+from jaxpose.slam.world import scene_params
+
+SAVE_EVERY_S = 30.0
+_PREVIEW_EVERY_S = 5.0
+_SHARE = 0.02  # of the time that previews may take
+_WIDTH = 80  # [px] of the map in a preview
+
+
+def keeper(folder: Path, recording: Recording, settings: dict[str, Any]) -> Callable[[Progress], None]:
+    """A callback that writes the settings once, and checkpoint and preview every few seconds."""
+    saved = time.perf_counter()
+    next_preview = 0.0
+
+    def keep(progress: Progress) -> None:
+        nonlocal saved, next_preview
+        if not (folder / "settings.json").exists() or progress.index == 0:
+            io.write_json(folder / "settings.json", settings)
+        if time.perf_counter() - saved > SAVE_EVERY_S:
+            slam_checkpoint.save(folder / "checkpoint.npz", progress.state)
+            saved = time.perf_counter()
+        now, last = time.perf_counter(), progress.index == progress.count - 1
+        if now > next_preview or last:
+            _preview(folder / "preview.png", recording, progress.state)
+            cost = time.perf_counter() - now
+            next_preview = time.perf_counter() + max(_PREVIEW_EVERY_S, cost / _SHARE)
+
+    return keep
+
+
+def _preview(path: Path, recording: Recording, state: SlamState) -> None:
+    frames, i = state.frames, state.done - 1
+    T_world_cam = frames.T_world_body[: i + 1] @ recording.T_body_cam
+    seen = render_frame(recording, i, T_world_cam[i], state.grid, scene_params(state.map), width=_WIDTH)
+    label = f"t = {recording.t[i]:.1f} s"
+    view = View(label, seen.photograph, seen.rgb, seen.frame_depth, seen.depth)
+    preview(path, T_world_cam, frames.lost[: i + 1], view)
