@@ -256,7 +256,8 @@ def _failed(system: System, state: SlamState, tracked: Tracked, reach: np.ndarra
     losses = frames.loss[1:i][~frames.lost[1:i]][-30:]
     usual = float(np.median(losses)) if len(losses) else np.inf
     least, most = system.config.track.minimum_valid, 2.0
-    if frames.lost[max(i - 2, 0) : i].any():
+    held = system.config.senses_speed and max(reach) < _FAR_OFF
+    if frames.lost[max(i - 2, 0) : i].any() and not held:
         least, most = (least, 1.3) if np.isfinite(reach).all() else _RECOGNISED
     explained = np.isfinite(tracked.loss) and tracked.valid >= least
     return not (explained and tracked.loss < most * usual)

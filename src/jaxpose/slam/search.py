@@ -53,8 +53,9 @@ def search(
 
     first = T_world_cam
     keys = jax.random.split(key, _ROUNDS)
+    spreads = jnp.asarray([_NARROWER**k for k in range(_ROUNDS)], axes.dtype)
     start = first, jax.lax.map(score, first, batch_size=CENTRES)
-    (best, _), _ = jax.lax.scan(improve, start, (_NARROWER ** jnp.arange(_ROUNDS), keys))
+    (best, _), _ = jax.lax.scan(improve, start, (spreads, keys))
     return best[0]
 
 

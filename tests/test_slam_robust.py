@@ -1,0 +1,131 @@
+"""Losses: the wide search in a closed-form room, lost frames bent, blackouts with and without an IMU."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxpose import metrics, se3
+from jaxpose.data.synthetic import RoomConfig, room
+from jaxpose.recording import Frame, Recording, select
+from jaxpose.slam.keyframes import look
+from jaxpose.slam.localise import _bent
+from jaxpose.slam.observe import Pixels
+from jaxpose.slam.run import SlamConfig, run
+from jaxpose.slam.search import CENTRES, search
+from jaxpose.slam.state import no_frames
+
+BAND = 0.15
+LOWER, UPPER = np.float32([-2, -1.5, -1]), np.float32([2, 1.5, 3])
+
+
+def truncated_box(point, direction):
+    """A room with three pairs of walls, as a map knows it: distances up to a band, colour by place."""
+    del direction
+    distance = jnp.min(jnp.concatenate([point - LOWER, UPPER - point]))
+    return jnp.clip(distance, -BAND, BAND), 0.5 + 0.4 * jnp.sin(3 * point)
+
+
+def box_pixels(T_world_cam, count=400):
+    """Exact depth and colour of the box at random pixels."""
+    rng = np.random.default_rng(0)
+    ray = np.concatenate([rng.uniform(-0.6, 0.6, (count, 2)), np.ones((count, 1))], axis=1)
+    direction, origin = ray @ T_world_cam[:3, :3].T, T_world_cam[:3, 3]
+    depth = np.min(np.where(direction > 0, UPPER - origin, LOWER - origin) / direction, axis=1)
+    points = origin + depth[:, None] * direction
+    return Pixels(*(jnp.asarray(x, jnp.float32) for x in (ray, depth, 0.5 + 0.4 * np.sin(3 * points))))
+
+
+def off(T, truth):
+    """Distances [m, rad] of two poses."""
+    xi = np.asarray(se3.log(se3.compose(se3.inverse(jnp.asarray(T)), jnp.asarray(truth, jnp.float32))))
+    return np.linalg.norm(xi[:3]), np.linalg.norm(xi[3:])
+
+
+@pytest.fixture(scope="module")
+def find():
+    return jax.jit(lambda T, s, pixels, key: search(truncated_box, T, s, pixels, BAND, key))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_search_finds_a_camera_that_prediction_missed(find, seed):
+    truth = np.asarray(se3.exp(jnp.array([0.1, -0.2, 0.3, 0.2, 0.1, -0.1])))
+    start = se3.compose(jnp.asarray(truth), se3.exp(jnp.array([0.2, -0.15, 0.1, 0.15, -0.1, 0.2])))
+    centres = jnp.tile(start[None], (CENTRES, 1, 1))
+    found = find(centres, jnp.array([0.25, 0.25]), box_pixels(truth), jax.random.key(seed))
+    metres, radians = off(found, truth)
+    assert off(start, truth)[0] > 0.25 and metres < 0.13 and radians < 0.08  # near enough to be aligned
+
+
+def test_a_search_begins_at_every_centre(find):
+    truth = np.asarray(se3.exp(jnp.array([0.5, -0.2, 0.3, 0.2, 1.0, -0.1])))
+    away = [se3.exp(jnp.array([0.1 * k, 0.0, 0.0, 0.0, -0.05 * k, 0.0])) for k in range(CENTRES - 1)]
+    near = se3.compose(jnp.asarray(truth), se3.exp(jnp.array([0.05, -0.05, 0.1, 0.05, -0.1, 0.02])))
+    found = find(jnp.stack([*away, near]), jnp.array([0.2, 0.2]), box_pixels(truth), jax.random.key(1))
+    metres, radians = off(found, truth)
+    assert metres < 0.08 and radians < 0.05
+
+
+def test_lost_frames_lead_to_where_the_camera_is_found():
+    t, frames = np.array([0.0, 1.0, 2.0, 4.0]), no_frames(4)
+    frames = frames.put(np.arange(4), T_world_body=np.eye(4), lost=[False, True, True, False])
+    correction = np.asarray(se3.exp(jnp.array([0.4, 0.0, 0.0, 0.0, 0.0, 0.8])), np.float64)
+    bent = _bent(frames, t, 0, 3, correction)
+    np.testing.assert_array_equal(bent.T_world_body[[0, 3]], np.tile(np.eye(4), (2, 1, 1)))
+    for i, share in ((1, 0.25), (2, 0.5)):
+        expected = np.asarray(se3.exp(share * jnp.array([0.4, 0.0, 0.0, 0.0, 0.0, 0.8])))
+        np.testing.assert_allclose(bent.T_world_body[i], expected, atol=1e-6)
+    assert np.all(frames.T_world_body == np.eye(4))  # what was given is as it was
+
+
+def test_a_frame_looks_like_itself_in_another_light():
+    rng = np.random.default_rng(0)
+    coarse = rng.uniform(20, 120, (12, 16))
+    rgb = np.repeat(np.kron(coarse, np.ones((5, 5)))[..., None], 3, axis=-1)
+    frame = Frame(rgb.astype(np.uint8), np.kron(rng.uniform(1, 3, (12, 16)), np.ones((5, 5))))
+    brighter = frame._replace(rgb=(2 * rgb).astype(np.uint8))
+    other = Frame(frame.rgb[::-1], frame.depth[:, ::-1])
+    difference = lambda a, b: np.mean((look(a) - look(b)) ** 2)
+    assert difference(frame, brighter) < 0.01 < 1 < difference(frame, other)
+    assert np.isfinite(look(Frame(0 * frame.rgb, 0 * frame.depth))).all()
+
+
+@pytest.fixture(scope="module")
+def walk() -> Recording:
+    return room(RoomConfig(duration_s=5.0, width=80, height=60))
+
+
+def blacked_out(recording: Recording, dark: range) -> Recording:
+    """The recording with frames that hold nothing."""
+
+    def read(i):
+        frame = recording.read(i)
+        return Frame(0 * frame.rgb, 0 * frame.depth) if i in dark else frame
+
+    return recording._replace(read=read)
+
+
+@pytest.mark.slow
+def test_a_camera_that_comes_back_is_recognised_without_an_imu(walk):
+    """2 s of darkness, in which it has gone where it was 1.6 s before."""
+    indices = np.concatenate([np.arange(12), np.arange(12, 22), np.arange(4, 12)])
+    back = select(walk, indices)._replace(t=np.arange(len(indices)) / 5, imu=None)
+    result = run(blacked_out(back, range(12, 22)))
+    assert result.lost[12:22].all() and not result.lost[:12].any() and not result.lost[22:].any()
+    assert not result.mapped[12:23].any() and result.mapped[24:].any()  # the first found is not mapped yet
+    assert result.uncertain[12:22].all()
+    truth = back.T_world_cam
+    assert truth is not None
+    error = np.linalg.norm(result.T_world_cam[23:, :3, 3] - truth[23:, :3, 3], axis=1)
+    assert np.sqrt(np.mean(error**2)) < 0.05  # without alignment: in the world of before
+
+
+@pytest.mark.slow
+def test_an_imu_bridges_two_seconds_of_darkness(walk):
+    result = run(blacked_out(walk, range(10, 20)), SlamConfig(imu="combined"))
+    assert result.lost[10:20].all() and not result.lost[21:].any()
+    assert result.uncertain[10:20].all() and result.mapped[20:].any()
+    truth = walk.T_world_cam
+    assert truth is not None
+    error = np.linalg.norm(result.T_world_cam[:, :3, 3] - truth[:, :3, 3], axis=1)
+    assert error.max() < 0.06 and metrics.ate(result.T_world_cam, truth).rmse < 0.03
