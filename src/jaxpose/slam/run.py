@@ -130,7 +130,7 @@ def _due(system: System, state: SlamState, frame: Frame) -> bool:
     unconfirmed = frames.lost[i - 1] and not config.senses_speed
     blank = frame.rgb[::4, ::4].std() < _BLANK
     passed = system.recording.t[i] - system.recording.t[mapped[-1]]
-    return not unconfirmed and not blank and passed >= config.map_every_s
+    return bool(not unconfirmed and not blank and passed >= config.map_every_s)
 
 
 def _first_pose(recording: Recording) -> Float[np.ndarray, "4 4"]:
