@@ -176,7 +176,7 @@ def _searched(
     if last < i - 1:
         kept = np.append(np.flatnonzero(frames.keyframe), last)
         away = np.linalg.inv(T_world_predicted) @ frames.T_world_body[kept]
-        angle = rotation_angle_deg(away[:, :3, :3], np.eye(3)[None])
+        angle = rotation_angle_deg(away[:, :3, :3], np.tile(np.eye(3), (len(kept), 1, 1)))
         off = np.stack([np.linalg.norm(away[:, :3, 3], axis=1), np.deg2rad(angle)], axis=1)
         kept = kept[(off <= 3 * reach).all(axis=1)]
         unlike = [np.mean((system.look(k) - look(frame)) ** 2) for k in kept.tolist()]
