@@ -17,8 +17,9 @@ from scipy.interpolate import splrep
 
 from jaxpose import io, metrics, numpy_field
 from jaxpose.data import blender
-from jaxpose.experiments import noisy_nerf
-from jaxpose.experiments.noisy_nerf_options import Config, NetConfig, load
+from jaxpose.experiments import joint_loop, noisy_nerf
+from jaxpose.experiments.joint_loop import NetConfig
+from jaxpose.experiments.noisy_nerf_options import Config, load
 from jaxpose.experiments.noisy_nerf_report import report, table
 from jaxpose.experiments.noisy_nerf_setup import _SMOKE, build, splined
 from jaxpose.experiments.noisy_nerf_studies import STUDIES
@@ -95,7 +96,7 @@ def test_every_field_starts_at_the_noisy_poses(pose):
     config = smoke(pose=pose)
     problem = load(config)
     setup = build(config, problem)
-    poses = noisy_nerf.pose_reader(setup)(setup.field.init(jax.random.key(0)))
+    poses = joint_loop.pose_reader(setup.field, problem.train.t)(setup.field.init(jax.random.key(0)))
     assert_allclose(poses, problem.T_start, atol=2e-3)
 
 
@@ -239,7 +240,7 @@ def test_what_a_run_leaves(tmp_path):
         "images of 24 pixels are too small for LPIPS"
     )
     loaded = noisy_nerf.load_run(outcome.folder)
-    poses = noisy_nerf.pose_reader(loaded.setup)(loaded.state.pose)
+    poses = joint_loop.pose_reader(loaded.setup.field, loaded.problem.train.t)(loaded.state.pose)
     assert metrics.pose_errors(poses, reference.T).rotation_deg == pytest.approx(
         errors.rotation_deg, rel=1e-4
     )

@@ -13,8 +13,9 @@ from jaxpose.experiments.noisy_nerf_setup import Setup
 from jaxpose.fields import set_progress
 from jaxpose.metrics import PoseErrors, Similarity
 from jaxpose.metrics_image import lpips, ssim
-from jaxpose.nerf import State, Viewer
+from jaxpose.nerf import Viewer
 from jaxpose.plots_nerf import HeldOut
+from jaxpose.train import State
 
 PROTOCOL = {
     "alignment": "similarity that maps estimated camera centres to the true ones (scale: ratio of spreads), "

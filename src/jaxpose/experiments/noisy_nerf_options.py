@@ -12,27 +12,14 @@ from scipy.spatial.distance import pdist
 from jaxpose.data import blender, llff, noise
 from jaxpose.data.orbit import DIAMETER, orbit
 from jaxpose.errors import DataError
-from jaxpose.nn import Activation
+from jaxpose.experiments.joint_loop import CHUNK, NetConfig
 from jaxpose.recording import Photographs, every, take
 
 Pose = Literal["posenet", "table", "bspline", "spline_reset"]
 Study = Literal["fields", "encoding", "size", "spline", "ablations"]
 ORBIT = Path("orbit")
-CHUNK = 100  # steps in one compiled call; a table is reset to a spline as often
 _WIDTHS = {"fast": 100, "paper": 400}  # [px]
 _SMOKE_WIDTH, _SMOKE_VIEWS = 24, 8
-
-
-@dataclass(frozen=True)
-class NetConfig:
-    """PoseNet's variants of tables 3 and 12; the defaults are the paper's main network."""
-
-    octaves: int = 5  # of the time encoding; 0: time alone
-    layers: int = 8
-    width: int = 256
-    coupled: bool = False  # one network with 7 outputs
-    activation: Activation = "relu"
-    window: tuple[float, float] | None = None  # coarse-to-fine on the time encoding, shares of the training
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """What the noisy-pose experiment says: a bar while it trains, then numbers with their protocol."""
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,7 +20,6 @@ class Progress(NamedTuple):
     extent: float  # [scene units]
     step: int
     loss: float
-    psnr: float  # [dB] of the training rays
     rotation_deg: float
     translation: float  # [scene units]
 
@@ -30,7 +30,11 @@ def progress_bar() -> Callable[[Progress], None]:
 
     def on_progress(progress: Progress) -> None:
         off = f"{progress.rotation_deg:.2f} deg {100 * progress.translation / progress.extent:.2f}%"
-        state = {"loss": f"{progress.loss:.5f}", "PSNR": f"{progress.psnr:.2f} dB", "off": off}
+        state = {
+            "loss": f"{progress.loss:.5f}",
+            "PSNR": f"{-10 * math.log10(progress.loss):.2f} dB",
+            "off": off,
+        }
         bar(progress.label or "training", progress.step, progress.steps, state)
 
     return on_progress

@@ -13,11 +13,13 @@ from jaxtyping import Array, Float
 from scipy.interpolate import make_splrep
 
 from jaxpose import fields
-from jaxpose.experiments.noisy_nerf_options import CHUNK, Config, Problem
+from jaxpose.experiments.joint_loop import CHUNK
+from jaxpose.experiments.noisy_nerf_options import Config, Problem
 from jaxpose.fields import Params, PoseField, PoseNetConfig
 from jaxpose.io_field import Factor, bspline_factor, posenet_factor, stamped_factor, table_factor
-from jaxpose.nerf import Depths, Rate, TrainConfig, Views
+from jaxpose.nerf import Depths, TrainConfig, Views
 from jaxpose.scenes import NerfConfig, SceneField, nerf
+from jaxpose.train import Rate
 
 _FAST_SCENE = NerfConfig(
     layers=4, width=96, skip=2, colour_width=48, octaves=7, window=(0.15, 0.5), quiet=True

@@ -1,0 +1,215 @@
+"""NeRF from asynchronous events: a scene and the trajectory of an event camera optimised together.
+
+Without options: the events of one turn around an object, made on the fly, its positions known at 10 instants
+and linear between, PoseNet against that, a run folder under outputs/event_nerf. `--data` reads EventNeRF's
+folders, DAVIS text, HDF5 (DSEC) and npz. `--study known` puts both trajectories side by side for 20, 10 and 6
+known instants (table 4), `--study offset` for a turntable whose axis is wrong.
+"""
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxpose import command, io, io_checkpoint, metrics, plots_events, plots_nerf
+from jaxpose.experiments import joint_loop
+from jaxpose.experiments.event_nerf_measure import PROTOCOL, Measured, measure, some
+from jaxpose.experiments.event_nerf_options import Config, Problem, Study, decisive, load
+from jaxpose.experiments.event_nerf_report import Progress, progress_bar, report, table
+from jaxpose.experiments.event_nerf_setup import Setup, build, describe
+from jaxpose.fields import set_progress
+from jaxpose.io_camera import write_camera
+from jaxpose.io_field import write_field
+from jaxpose.train import State
+
+OnProgress = Callable[[Progress], None]
+_KNOWN = (20, 10, 6)  # table 4
+_OFFSETS_DEG = (1.0, 2.0, 2.85)  # EventNeRF reports up to 2.85 on real turntables
+
+
+class Outcome(NamedTuple):
+    """Where a run was written, and its results; those of a study under `runs`, by label."""
+
+    folder: Path
+    results: dict[str, Any]
+
+
+def run(config: Config, on_progress: OnProgress | None = None) -> Outcome:
+    """Train, measure and write the run folder; `resume` goes on where a killed run stopped.
+
+    Raises DataError or OSError for what cannot be used; then no folder is left behind.
+    """
+    started = time.perf_counter()
+    problem = load(config)
+    folder = io.run_folder("event_nerf", name=config.name, out=config.out)
+    if config.study is None:
+        return Outcome(folder, _single(config, problem, folder, on_progress, ""))
+    results = {}
+    for label, changed in _study(config, config.study).items():
+        inner = folder / label
+        inner.mkdir(exist_ok=True)
+        changed = replace(changed, study=None)
+        results[label] = _single(changed, load(changed), inner, on_progress, label)
+    whole = {
+        "experiment": "event_nerf",
+        "study": config.study,
+        "seed": config.seed,
+        "smoke": config.smoke,
+        "runs": results,
+        "versions": io.versions(),
+        "wall_s": time.perf_counter() - started,
+        "peak_rss_bytes": io.peak_rss_bytes(),
+    }
+    io.write_json(folder / "config.json", config)
+    io.write_text(folder / "table.md", table(results) + "\n")
+    io.write_json(folder / "results.json", whole)
+    return Outcome(folder, whole)
+
+
+class Loaded(NamedTuple):
+    """A finished run: `setup.field.pose(state.pose, t)` is the camera's pose at any time [s], and
+    `setup.scene.query(state.scene, point, direction)` the density and colour of the scene."""
+
+    problem: Problem
+    setup: Setup
+    state: State
+
+
+def load_run(folder: Path | str) -> Loaded:
+    """The scene and the trajectory that a run has left in its folder; its data are read again.
+
+    DataError or OSError for a folder that holds no run.
+    """
+    settings = json.loads((Path(folder) / "settings.json").read_text())
+    config = Config(
+        **settings | {"data": Path(settings["data"]), "net": joint_loop.net_config(settings["net"])}
+    )
+    problem = load(config)
+    setup = build(config, problem)
+    start = joint_loop.fresh(setup.trainer, setup.train.steps, config.seed)
+    state = io_checkpoint.load(Path(folder) / "checkpoint.npz", start).state
+    return Loaded(problem, setup, state._replace(scene=set_progress(state.scene, jnp.ones(()))))
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """The command: `python -m jaxpose.experiments.event_nerf`."""
+    config = command.parse("event_nerf", Config, __doc__, args)
+    command.guarded("event_nerf", lambda: report(*run(config, progress_bar())))
+
+
+def _study(config: Config, study: Study) -> dict[str, Config]:
+    """The configs of runs side by side, by label."""
+    if study == "known":
+        changes = {f"known{known}": {"known": known} for known in _KNOWN}
+    else:
+        changes = {f"offset{offset:g}": {"axis_offset_deg": offset} for offset in _OFFSETS_DEG}
+    return {
+        f"{label}-{pose}": replace(config, pose=pose, **change)
+        for label, change in changes.items()
+        for pose in ("linear", "posenet")
+    }
+
+
+def _single(
+    config: Config, problem: Problem, folder: Path, on_progress: OnProgress | None, label: str
+) -> dict[str, Any]:
+    """One training, measured and written; what a killed or finished run has left is used with `resume`."""
+    started = time.perf_counter()
+    finished = folder / "results.json"
+    joint_loop.prepare(folder, config, decisive(config), resume=config.resume)
+    if finished.exists():
+        return json.loads(finished.read_text())
+    setup = build(config, problem)
+    trained = _train(config, problem, setup, folder / "checkpoint.npz", on_progress, label)
+    measured = measure(problem, setup, trained.state)
+    _draw(folder, config, problem, measured)
+    _write_poses(folder, problem, setup, trained.state, measured)
+    seconds = float(trained.history[-1, -1])
+    results = {
+        "experiment": "event_nerf",
+        "data": problem.about,
+        "training": describe(config, setup),
+        "protocol": PROTOCOL,
+        "seed": config.seed,
+        "smoke": config.smoke,
+        **measured.numbers,
+        "train_s": seconds,
+        "seconds_per_step": seconds / setup.train.steps,
+        "history_columns": joint_loop.COLUMNS,
+        "history": trained.history,
+        "versions": io.versions(),
+        "wall_s": time.perf_counter() - started,
+        "peak_rss_bytes": io.peak_rss_bytes(),
+    }
+    io.write_json(finished, results)  # last: with it the run counts as finished
+    return results
+
+
+def _train(
+    config: Config,
+    problem: Problem,
+    setup: Setup,
+    checkpoint: Path,
+    on_progress: OnProgress | None,
+    label: str,
+) -> joint_loop.Trained:
+    at = some(len(problem.recording.t))
+    truth = problem.recording.T_world_cam[at]
+    poses = joint_loop.pose_reader(setup.field, problem.recording.t[at])
+
+    def on_row(row):
+        if on_progress is not None:
+            step, loss, rotation_deg, translation, _ = row
+            on_progress(Progress(label, setup.train.steps, int(step), loss, rotation_deg, translation))
+
+    return joint_loop.train(
+        setup.trainer,
+        joint_loop.fresh(setup.trainer, setup.train.steps, config.seed),
+        setup.data,
+        lambda params: metrics.pose_errors(poses(params), truth),
+        checkpoint,
+        on_row,
+    )
+
+
+def _draw(folder: Path, config: Config, problem: Problem, measured: Measured) -> None:
+    numbers, about, recording = measured.numbers, problem.about, problem.recording
+    title = f"{about['data']}, {about['events']} events\n{about['poses']}"
+    found = (
+        f"{config.pose}, {config.loss} loss: translation error "
+        f"{numbers['start']['translation_error']:.4f} to {numbers['translation_error']:.4f} units, "
+        f"rotation {numbers['start']['rotation_error_deg']:.2f} to "
+        f"{numbers['rotation_error_deg']:.2f} deg"
+    )
+    camera = recording.camera
+    plots_events.windows(folder / "events.png", recording.events, camera.height, camera.width, title)
+    before, after = (
+        (errors.rotation_errors_deg, errors.translation_errors)
+        for errors in (measured.at_start, measured.at_end)
+    )
+    plots_events.errors(folder / "pose_errors.png", measured.t, before, after, f"{title}\n{found}")
+    if measured.views:
+        psnr = f"{config.pose}, {config.loss} loss, held-out PSNR {numbers['psnr']:.2f} dB"
+        plots_nerf.held_out(folder / "held_out.png", measured.views, f"{title}\n{psnr}")
+
+
+def _write_poses(folder: Path, problem: Problem, setup: Setup, state: State, measured: Measured) -> None:
+    """The trajectory, aligned with the data's own world, at its stamps and as one continuous field."""
+    recording = problem.recording
+    io.write_tum(folder / "trajectory.txt", io.Trajectory(recording.t, measured.T_estimate))
+    io.write_tum(folder / "reference.txt", io.Trajectory(recording.t, recording.T_world_cam))
+    with io.atomic(folder / "start.npz") as temporary:
+        np.savez(temporary, t=recording.t, T_world_cam=problem.T_start)
+    write_field(
+        folder / "field.npz", setup.span, setup.factors(state.pose), alignment=measured.at_end.alignment
+    )
+    write_camera(folder / "camera.json", recording.camera, (), ".")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,161 @@
+"""Options of the event experiment, and the events and inexact poses that they name."""
+
+import math
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.distance import pdist
+from scipy.spatial.transform import Rotation
+
+from jaxpose.data import event_orbit, event_recordings
+from jaxpose.data.orbit import DIAMETER, FAR, NEAR
+from jaxpose.errors import DataError
+from jaxpose.events import Mosaic
+from jaxpose.experiments.joint_loop import CHUNK, NetConfig
+from jaxpose.nerf_events import Loss
+from jaxpose.recording import EventRecording
+
+Pose = Literal["posenet", "linear"]
+Study = Literal["known", "offset"]
+ORBIT = Path("orbit")
+_WIDTH, _SMOKE_WIDTH, _SMOKE_POSES = 100, 16, 60
+_KNOWN = 10
+
+
+@dataclass(frozen=True)
+class Config:
+    """Settings of a run; the events and these are all that a result depends on."""
+
+    # A folder or file of events (EventNeRF, DAVIS text, HDF5, npz); "orbit": a turntable made on the fly.
+    data: Path = ORBIT
+    pose: Pose = "posenet"  # the trajectory is refined by a PoseNet, or stays as it starts
+    loss: Loss = "asynchronous"  # each event at its own time, or EventNeRF's windows
+    preset: Literal["fast", "paper"] = (
+        "fast"  # a small network for CPUs, or the sizes of EventNeRF and the paper
+    )
+    # Instants at which positions are known, straight lines between; orientations are kept. None: all that the
+    # data have; the orbit's default is 10, unless its axis is wrong.
+    known: int | None = None
+    axis_offset_deg: float = 0.0  # the turntable's axis, as the camera sees it, is wrong by this
+    threshold: float | None = None  # change of log intensity per event; None: what the data tell, or 0.25
+    mosaic: Mosaic | None = None  # the sensor's colours; None: what the data tell
+    image_width: int | None = None  # [px] of the orbit's sensor; None: 100
+    seed: int = 0  # of the orbit's paint and noise, the network's start, the events drawn
+    steps: int | None = None  # None: 3000, with preset paper 200,000
+    events: int | None = None  # per step; None: 512, with preset paper 1024
+    net: NetConfig = NetConfig()
+    study: Study | None = None  # table 4 (known: 20, 10 and 6 instants), or offsets, both fields side by side
+    resume: bool = False  # go on where a killed run stopped
+    smoke: bool = False  # everything shrunk to seconds; the numbers then mean nothing
+    out: Path | None = None  # exactly this folder; None: outputs/event_nerf/<name or time stamp>
+    name: str | None = None  # of the run folder
+
+    def __post_init__(self):
+        for option, least in (
+            ("known", 2), ("axis_offset_deg", 0), ("seed", 0), ("image_width", 8), ("steps", CHUNK), ("events", 1),
+        ):  # fmt: skip
+            value = getattr(self, option)
+            if value is not None and not least <= value < math.inf:
+                raise ValueError(f"--{option.replace('_', '-')}: expected at least {least}, got {value}")
+        if self.threshold is not None and not 0 < self.threshold < math.inf:
+            raise ValueError(f"--threshold: expected a positive number, got {self.threshold}")
+        if self.axis_offset_deg >= 45:
+            raise ValueError(f"--axis-offset-deg: expected less than 45, got {self.axis_offset_deg:g}")
+        if self.steps is not None and self.steps % CHUNK:
+            raise ValueError(f"--steps: expected a multiple of {CHUNK}, got {self.steps}")
+        if self.resume and self.out is None and self.name is None:
+            raise ValueError("--resume: expected --out DIR or --name NAME with it")
+
+
+# What a run's numbers do not depend on.
+_INCIDENTAL = ("resume", "out", "name", "study")
+
+
+def decisive(config: Config) -> dict[str, Any]:
+    """The settings that a resumed run must share with the one it resumes."""
+    return {f.name: getattr(config, f.name) for f in fields(config) if f.name not in _INCIDENTAL}
+
+
+class Problem(NamedTuple):
+    """Events, and the poses that the training starts from, at the recording's stamps."""
+
+    recording: EventRecording
+    T_start: Float[np.ndarray, "k 4 4"]
+    threshold: float
+    near: float  # z-depths between which the scene lies [scene units]
+    far: float
+    background: float | None
+    extent: float  # largest distance between true cameras [scene units]
+    about: dict[str, Any]  # the data and what is wrong with the poses, in words and numbers
+
+
+def load(config: Config) -> Problem:
+    """Read or make the events, and the poses to start from.
+
+    DataError or OSError for what cannot be used.
+    """
+    orbiting = config.data == ORBIT
+    if orbiting:
+        width = _SMOKE_WIDTH if config.smoke else config.image_width or _WIDTH
+        poses = _SMOKE_POSES if config.smoke else 1000
+        recording = event_orbit.event_orbit(width, config.seed, poses=poses, mosaic=config.mosaic or "rggb")
+        near, far, background = NEAR, FAR, event_orbit.BACKGROUND
+    else:
+        recording = event_recordings.load(config.data, mosaic=config.mosaic)
+        if len(recording.t) < 2:
+            raise DataError(f"{config.data}: expected poses at 2 instants or more, got {len(recording.t)}")
+        near, far, background = _depths(recording)
+    if len(recording.events.t) == 0:
+        raise DataError(f"{config.data}: expected events, got none")
+    known = config.known
+    if known is None and orbiting and not config.axis_offset_deg:
+        known = _KNOWN
+    if known is not None and known > len(recording.t):
+        raise DataError(f"--known: expected at most the {len(recording.t)} poses of the data, got {known}")
+    T_start, words = _inexact(recording, known, config.axis_offset_deg)
+    centres = recording.T_world_cam[:, :3, 3]
+    thinned = centres[:: max(1, len(centres) // 200)]
+    camera = recording.camera
+    about = {
+        "data": "synthetic orbit with events" if orbiting else recording.name,
+        "events": len(recording.events.t),
+        "span_s": float(np.ptp(recording.events.t)),
+        "size": (camera.width, camera.height),
+        "mosaic": recording.mosaic,
+        "extent": DIAMETER if orbiting else float(pdist(thinned).max()),
+        "poses": words,
+        "notes": recording.notes,
+    }
+    threshold = config.threshold or recording.threshold or 0.25
+    return Problem(recording, T_start, threshold, near, far, background, about["extent"], about)
+
+
+def _inexact(
+    recording: EventRecording, known: int | None, offset_deg: float
+) -> tuple[Float[np.ndarray, "k 4 4"], str]:
+    """The recording's poses with positions on straight lines between known ones, about a wrong axis."""
+    truth, t = recording.T_world_cam, recording.t
+    T_start, words = truth.copy(), [f"known at all {len(t)} instants"]
+    if known is not None:
+        at = np.round(np.linspace(0, len(t) - 1, known + recording.cyclic)).astype(int)
+        for axis in range(3):
+            T_start[:, axis, 3] = np.interp(t, t[at], truth[at, axis, 3])
+        words = [f"positions known at {known} instants, linear between, orientations kept"]
+    if offset_deg:
+        # All that a camera knows of a turntable is where it sees the axis: turned about its own y axis.
+        T_start[:, :3, :3] = (
+            T_start[:, :3, :3] @ Rotation.from_euler("y", offset_deg, degrees=True).as_matrix()
+        )
+        words.append(f"axis wrong by {offset_deg:g} degrees about the camera's y axis")
+    return T_start, ", ".join(words)
+
+
+def _depths(recording: EventRecording) -> tuple[float, float, float | None]:
+    """Where the scene lies: as the held-out views say, or within a unit sphere about the world's origin."""
+    if recording.held_out is not None:
+        return recording.held_out.near, recording.held_out.far, event_orbit.BACKGROUND
+    distance = np.linalg.norm(recording.T_world_cam[:, :3, 3], axis=1)
+    return max(float(distance.min()) - 1, 0.05 * float(distance.min())), float(distance.max()) + 1, None

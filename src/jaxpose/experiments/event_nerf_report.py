@@ -1,0 +1,88 @@
+"""What the event experiment says: a bar while it trains, then numbers with their protocol."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from jaxpose.command import markdown_table, step_bar
+
+_COLUMNS: tuple[str, ...] = (
+    "run", "RE start", "RE [deg]", "TE start", "TE [units]", "TE [%]", "PSNR [dB]", "SSIM", "LPIPS", "train [s]",
+)  # fmt: skip
+
+
+class Progress(NamedTuple):
+    """Where a training is: after `step` of `steps`."""
+
+    label: str
+    steps: int
+    step: int
+    loss: float
+    rotation_deg: float
+    translation: float  # [scene units]
+
+
+def progress_bar() -> Callable[[Progress], None]:
+    """A callback for `run` that draws a bar on stderr for each training."""
+    bar = step_bar()
+
+    def on_progress(progress: Progress) -> None:
+        off = f"{progress.rotation_deg:.2f} deg {progress.translation:.4f} units"
+        bar(
+            progress.label or "training",
+            progress.step,
+            progress.steps,
+            {"loss": f"{progress.loss:.5f}", "off": off},
+        )
+
+    return on_progress
+
+
+def table(runs: dict[str, dict[str, Any]]) -> str:
+    """Results side by side, in Markdown."""
+    rows = [_COLUMNS] + [
+        (
+            label,
+            f"{run['start']['rotation_error_deg']:.3f}",
+            f"{run['rotation_error_deg']:.3f}",
+            f"{run['start']['translation_error']:.4f}",
+            f"{run['translation_error']:.4f}",
+            f"{run['translation_error_percent']:.3f}",
+            *(
+                "n/a" if run[name] is None else f"{run[name]:.{digits}f}"
+                for name, digits in (("psnr", 2), ("ssim", 3), ("lpips", 3))
+            ),
+            f"{run['train_s']:.0f}",
+        )
+        for label, run in runs.items()
+    ]
+    return markdown_table(rows)
+
+
+def report(folder: Path, results: dict[str, Any]) -> str:
+    """The numbers of a run with their protocol, and where everything is."""
+    runs = results.get("runs") or {results["training"]["pose"]: results}
+    one = next(iter(runs.values()))
+    data, training, protocol = one["data"], one["training"], one["protocol"]
+    width, height = data["size"]
+    smoke = "  SMOKE RUN, the numbers mean nothing" if results["smoke"] else ""
+    lines = [
+        f"event_nerf: {data['data']}, {data['events']} events of {width}x{height} ({data['mosaic']}) in "
+        f"{data['span_s']:.3g} s, preset {training['preset']}, {training['steps']} steps of "
+        f"{training['events']} events x {training['samples']} samples, {training['loss']} loss, "
+        f"threshold {training['threshold']:g}, seed {results['seed']}{smoke}",
+        *(f"  note         {note}" for note in data["notes"]),
+        *(f"  poses        {label}: {run['data']['poses']}" for label, run in runs.items()),
+        "",
+        table(runs),
+        "",
+        f"  RE           {protocol['rotation_error_deg']}",
+        f"  TE           {protocol['translation_error']}; in percent of the cameras' extent, "
+        f"{data['extent']:.3g}",
+        f"  alignment    {protocol['alignment']}",
+        f"  PSNR ...     {protocol['psnr, ssim, lpips']}",
+        f"  cost         {results['wall_s']:.0f} s in all, "
+        f"{results['peak_rss_bytes'] / 2**30:.2f} GiB of memory at most",
+        f"  written to   {folder}",
+    ]
+    return "\n".join(lines)

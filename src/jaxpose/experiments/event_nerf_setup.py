@@ -1,0 +1,128 @@
+"""What is trained in the event experiment: scene, pose field and their rates, by preset."""
+
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxpose import events, fields, nerf_events
+from jaxpose.experiments.event_nerf_options import Config, Problem
+from jaxpose.experiments.joint_loop import CHUNK
+from jaxpose.fields import Params, PoseField, PoseNetConfig
+from jaxpose.io_field import Factor, posenet_factor, stamped_factor
+from jaxpose.nerf import Depths
+from jaxpose.nerf_events import EventData, EventTrainConfig
+from jaxpose.scenes import NerfConfig, SceneField, nerf
+from jaxpose.train import Rate, Trainer
+
+_FAST_SCENE = NerfConfig(
+    layers=4, width=96, skip=2, colour_width=48, octaves=7, window=(0.1, 0.5), quiet=True
+)
+_SMOKE_SCENE = NerfConfig(layers=2, width=16, skip=None, colour_width=8, octaves=4, window=(0.1, 0.5))
+_FAST = EventTrainConfig(steps=3000, events=512, samples=32, chunk=32)
+_PAPER = EventTrainConfig(steps=200_000, events=1024, samples=192, chunk=16)
+_SMOKE = EventTrainConfig(steps=CHUNK, events=32, samples=8, chunk=32)
+# Adam's first and last rate and where in the training it starts, for translation and rotation.
+_RATES = {
+    "fast": {"translation": Rate(6e-4, 2e-5, 0.03), "rotation": Rate(3e-5, 2e-6, 0.06)},
+    "paper": {"translation": Rate(2e-4, 2e-6), "rotation": Rate(5e-5, 5e-7)},
+}
+
+
+class Setup(NamedTuple):
+    """A scene and a pose field (camera-to-world), and how to train them."""
+
+    scene: SceneField
+    field: PoseField
+    factors: Callable[[Params], tuple[Factor, ...]]  # of the field, for `io_field.write_field`
+    rates: dict[str, Rate]  # of the scene and, where it moves, of the parts of the pose field
+    train: EventTrainConfig
+    depths: Depths
+    span: tuple[float, float]
+    trainer: Trainer
+    data: EventData
+
+
+def build(config: Config, problem: Problem) -> Setup:
+    """Scene, pose field, rates and data that the config names, for these events."""
+    recording, paper = problem.recording, config.preset == "paper"
+    if config.smoke:
+        scene, train = nerf(_SMOKE_SCENE), _SMOKE
+    else:
+        scene, train = (nerf(), _PAPER) if paper else (nerf(_FAST_SCENE), _FAST)
+        train = replace(train, steps=config.steps or train.steps, events=config.events or train.events)
+    # An event whose pose is not known is not asked for.
+    t = recording.events.t
+    span = (float(max(t[0], recording.t[0])), float(min(t[-1], recording.t[-1])))
+    train = replace(
+        train,
+        loss=config.loss,
+        threshold=problem.threshold,
+        longest_s=(span[1] - span[0]) / 20,
+        background=problem.background,
+    )
+    depths = Depths(problem.near, problem.far)
+    field, factors, pose_rates = _field(config, problem, span)
+    scene_rate = Rate(5e-4, 5e-4) if paper else Rate(1e-3, 1e-4)
+    trainer = nerf_events.trainer(
+        scene, field, recording.camera, depths, span, scene_rate, pose_rates, train
+    )  # fmt: skip
+    return Setup(
+        scene,
+        field,
+        factors,
+        {"scene": scene_rate, **pose_rates},
+        train,
+        depths,
+        span,
+        trainer,
+        _data(problem, span),
+    )
+
+
+def describe(config: Config, setup: Setup) -> dict[str, Any]:
+    """The settings of a training, in words and numbers."""
+    train = asdict(setup.train)
+    del train["chunk"]
+    return {
+        "pose": config.pose,
+        "preset": config.preset,
+        **train,
+        "net": asdict(config.net) if config.pose == "posenet" else None,
+        "rates": {"first, last, start": {name: list(rate) for name, rate in setup.rates.items()}},
+    }
+
+
+def _field(
+    config: Config, problem: Problem, span: tuple[float, float]
+) -> tuple[PoseField, Callable[[Params], tuple[Factor, ...]], dict[str, Rate]]:
+    """The trajectory as a field and as factors of its file, and the rates of its parameters."""
+    t, T_start = (jnp.asarray(x, jnp.float32) for x in (problem.recording.t, problem.T_start))
+    initial, start = fields.stamped(t, T_start), stamped_factor(t, T_start)
+    if config.pose == "linear":
+        return PoseField(lambda key: {}, lambda params, t: initial(t)), lambda params: (start,), {}
+    net = replace(config.net, layers=2, width=32) if config.smoke else config.net
+    posenet = PoseNetConfig(span=span, translation_scale=problem.extent / 2, **asdict(net))
+    rates = _RATES[config.preset]
+    if config.net.coupled:
+        rates = {"coupled": rates["rotation"]}
+    if config.net.window is not None:
+        rates = rates | {"progress": Rate(1.0, 1.0)}
+    field = fields.refine(fields.posenet(posenet), initial, side="world")
+    return field, lambda params: (posenet_factor(posenet, params), start), rates
+
+
+def _data(problem: Problem, span: tuple[float, float]) -> EventData:
+    """The events within the span, by pixel, on the device."""
+    recording = problem.recording
+    width, height = recording.camera.width, recording.camera.height
+    inside = (recording.events.t >= span[0]) & (recording.events.t <= span[1])
+    streams = events.by_pixel(events.Events(*(column[inside] for column in recording.events)), height, width)
+    streams = jax.tree.map(
+        lambda x: jnp.asarray(x, jnp.float32 if np.issubdtype(x.dtype, np.floating) else jnp.int32), streams
+    )
+    mask = events.mosaic_mask(recording.mosaic, height, width)
+    return EventData(streams, jnp.asarray(mask.reshape(-1, 3)))
