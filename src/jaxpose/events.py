@@ -52,13 +52,10 @@ def log_intensity(rgb: FloatArray, offset: float = 0.1) -> FloatArray:
 
 def mosaic_mask(mosaic: Mosaic, height: int, width: int) -> Float[np.ndarray, "h w 3"]:
     """1 for the colours that a pixel sees; a monochrome pixel sees all three."""
-    if mosaic not in ("mono", "rggb"):
-        raise ValueError(f"mosaic: expected mono or rggb, got {mosaic}")
-    mask = np.ones((height, width, 3), np.float32)
-    if mosaic == "rggb":
-        row, column = np.mgrid[:height, :width] % 2
-        mask = np.eye(3, dtype=np.float32)[row + column]
-    return mask
+    if mosaic == "mono":
+        return np.ones((height, width, 3), np.float32)
+    row, column = np.mgrid[:height, :width] % 2
+    return np.eye(3, dtype=np.float32)[row + column]
 
 
 def simulate(

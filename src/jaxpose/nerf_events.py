@@ -127,11 +127,8 @@ def window_pairs(
     nth = jax.random.randint(changed_key, (positives,), 0, jnp.maximum(passed[-1], 1)) + 1
     changed = jnp.searchsorted(passed, nth)
     anywhere = jax.random.randint(any_key, (config.events,), 0, len(pixels))
-    pixel = jnp.where(
-        jnp.arange(config.events) < positives * (passed[-1] > 0),
-        jnp.resize(changed, (config.events,)),
-        anywhere,
-    )
+    from_changed = (jnp.arange(config.events) < positives) & (passed[-1] > 0)
+    pixel = jnp.where(from_changed, jnp.resize(changed, (config.events,)), anywhere)
     same = lambda t: jnp.broadcast_to(t, (config.events,))
     return Compared(pixel, same(end), same(before), change[pixel], same(jnp.ones(())))
 

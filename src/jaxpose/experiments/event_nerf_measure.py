@@ -28,8 +28,8 @@ PROTOCOL = {
     "same, as BARF defines it [scene units]",
     "centre_error": "distance of camera centres after alignment, mean over the same [scene units]",
     "psnr, ssim, lpips": "mean over the held-out views, their true poses brought into the estimate's frame "
-    "by the alignment, no test-time optimisation; first slope and offset of log intensity are fitted for each "
-    "colour over all views, as EventNeRF does",
+    "by the alignment, no test-time optimisation; first slope and offset of log intensity are fitted for "
+    "each colour over all views, as EventNeRF does",
 }
 
 

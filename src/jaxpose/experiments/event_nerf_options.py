@@ -55,7 +55,8 @@ class Config:
 
     def __post_init__(self):
         for option, least in (
-            ("known", 2), ("axis_offset_deg", 0), ("seed", 0), ("image_width", 8), ("steps", CHUNK), ("events", 1),
+            ("known", 2), ("axis_offset_deg", 0), ("seed", 0), ("image_width", 8), ("steps", CHUNK),
+            ("events", 1),
         ):  # fmt: skip
             value = getattr(self, option)
             if value is not None and not least <= value < math.inf:

@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 from jaxpose.command import markdown_table, step_bar
 
 _COLUMNS: tuple[str, ...] = (
-    "run", "RE start", "RE [deg]", "TE start", "TE [units]", "TE [%]", "PSNR [dB]", "SSIM", "LPIPS", "train [s]",
+    "run", "RE start", "RE [deg]", "TE start", "TE [units]", "TE [%]", "PSNR [dB]", "SSIM", "LPIPS",
+    "train [s]",
 )  # fmt: skip
 
 

@@ -105,8 +105,8 @@ def pose_reader(field: PoseField, t: Float[np.ndarray, " n"]) -> Callable[[Any],
 
 def net_config(settings: dict[str, Any]) -> NetConfig:
     """PoseNet's variant from what `prepare` wrote."""
-    window = settings["window"]
-    return NetConfig(**settings | {"window": None if window is None else tuple(window)})
+    window = settings.pop("window")
+    return NetConfig(**settings, window=window and tuple(window))
 
 
 def _plain(value: Any) -> Any:
