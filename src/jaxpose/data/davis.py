@@ -7,7 +7,7 @@ from typing import NoReturn
 
 import numpy as np
 
-from jaxpose.data.event_beside import load_stream
+from jaxpose.data.event_beside import Source, load_source, with_camera
 from jaxpose.data.event_stream import BLOCK, Block, Stream, Unit
 from jaxpose.data.images import found, image_size, some
 from jaxpose.data.photographs import extent_depths, read_images
@@ -38,7 +38,7 @@ def load(
     """Read the folder `path`: `events.txt`, else the only `events*.txt` (or name the file itself).
 
     Time 0 is the first event's stamp. `calib.txt` is fx fy cx cy k1 k2 p1 p2 k3; the sensor is as large as
-    the images, else `size` (width, height), else as `event_beside.find_camera` says. `groundtruth.txt` has
+    the images, else `size` (width, height), else as `event_beside.with_camera` says. `groundtruth.txt` has
     T_world_cam as `t tx ty tz qx qy qz qw`, given as it is, before and after the events too.
 
     `frames` are the images of `images.txt` (lines of stamp and file name) during the events, with the one
@@ -46,29 +46,28 @@ def load(
     Their near and far are a guess from how far the camera moves. What was left out or assumed is told in
     `notes`; `span`, `unit` and what is refused are those of `event_clean.clean`.
     """
-    stream = text_stream(Path(path))
-    folder = stream.file.parent
-    images = read_list(folder / "images.txt") if (folder / "images.txt").is_file() else None
-    stated = image_size(images.files[0]) if images else size
-    if stated and size and size != stated:
-        raise DataError(
-            f"{folder / 'images.txt'}: expected images of {size[0]}x{size[1]}, got {stated[0]}x{stated[1]}"
-        )
-    truth = folder / "groundtruth.txt"
-    recording, zero_s = load_stream(stream, truth, mosaic=mosaic, size=stated, unit=unit, span=span)
-    if images is None:
+    source = find(path, size=size)
+    folder = source.stream.file.parent
+    recording, zero_s = load_source(source, folder / "groundtruth.txt", mosaic=mosaic, unit=unit, span=span)
+    if not (folder / "images.txt").is_file():
         return recording
+    images = read_list(folder / "images.txt")
     frames, notes = _frames(folder, images._replace(t=images.t - zero_s), recording)
     return recording._replace(frames=frames, notes=(*recording.notes, *notes))
 
 
-def text_stream(path: Path) -> Stream:
-    """The events of a text file, or of the only one in a folder, with stamps that should be seconds.
-
-    Lines from # on are comments. DataError naming file and line for what is not four numbers.
-    """
+def find(path: Path | str, *, size: tuple[int, int] | None = None) -> Source:
+    """The file and the camera that `load` reads."""
+    path = Path(path)
     file = path if path.is_file() else _only_file(path)
-    return Stream(file, lambda: _blocks(file), lambda row: f"{file}:{_line_of(file, row)}", "s")
+    stream = Stream(file, lambda: _blocks(file), lambda row: f"{file}:{_line_of(file, row)}", "s")
+    listing = file.parent / "images.txt"
+    if not listing.is_file():
+        return with_camera(stream, size)
+    stated = image_size(read_list(listing).files[0])
+    if size and size != stated:
+        raise DataError(f"{listing}: expected images of {size[0]}x{size[1]}, got {stated[0]}x{stated[1]}")
+    return with_camera(stream, stated)
 
 
 def _only_file(folder: Path) -> Path:

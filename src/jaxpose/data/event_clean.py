@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxpose.data.event_stream import Stream, Tally, Unit, inside, reach, tallied
+from jaxpose.data.event_stream import Stream, Tally, Unit, inside, listed, reach, tallied
 from jaxpose.errors import DataError
 from jaxpose.events import Events
 
@@ -131,11 +131,6 @@ def _notes(stream: Stream, size: tuple[int, int], unit: Unit | None, tally: Tall
             f"{tally.most_back:.3g} s: sorted"
         )
     return tuple(notes)
-
-
-def listed(polarities: frozenset[float]) -> str:
-    """Polarities in words."""
-    return " and ".join(f"{value:g}" for value in sorted(polarities))
 
 
 def _in_words(span: tuple[float, float]) -> str:

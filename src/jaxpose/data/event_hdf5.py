@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxpose.data.event_beside import load_stream
+from jaxpose.data.event_beside import Source, load_source, with_camera
 from jaxpose.data.event_stream import BLOCK, Block, Stream, Unit
 from jaxpose.data.images import found, some
 from jaxpose.errors import DataError
@@ -37,18 +37,19 @@ def load(
     `events/` has x, y, p and t, t in microseconds, to which `t_offset` is added where there is one; time 0
     is the first event's stamp. `ms_to_idx` is not used. Pixels are as recorded, not rectified. In the folder
     of the file may lie `poses.txt`, T_world_cam in TUM's format on the clock of t + t_offset, and the camera
-    (`event_beside.find_camera`; it also says what `size` is for). What was left out or assumed is told in
+    (`event_beside.with_camera`; it also says what `size` is for). What was left out or assumed is told in
     `notes`; `span`, `unit` and what is refused are those of `event_clean.clean`. Needs h5py and hdf5plugin
     (extra `hdf5`); DataError without them.
     """
-    stream = hdf5_stream(_file(Path(path)))
-    truth = stream.file.parent / "poses.txt"
-    return load_stream(stream, truth, mosaic=mosaic, size=size, unit=unit, span=span)[0]
+    source = find(path, size=size)
+    truth = source.stream.file.parent / "poses.txt"
+    return load_source(source, truth, mosaic=mosaic, unit=unit, span=span)[0]
 
 
-def hdf5_stream(file: Path) -> Stream:
-    """The events of an HDF5 file, of which no more than a block is in memory; DataError for what is none."""
-    return Stream(file, lambda: _blocks(file), lambda row: f"{file}: event {row}", "us")
+def find(path: Path | str, *, size: tuple[int, int] | None = None) -> Source:
+    """The file and the camera that `load` reads."""
+    file = _file(Path(path))
+    return with_camera(Stream(file, lambda: _blocks(file), lambda row: f"{file}: event {row}", "us"), size)
 
 
 def _files(folder: Path) -> list[Path]:

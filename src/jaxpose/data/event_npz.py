@@ -9,7 +9,7 @@ from typing import IO
 
 import numpy as np
 
-from jaxpose.data.event_beside import load_stream
+from jaxpose.data.event_beside import Source, load_source, with_camera
 from jaxpose.data.event_stream import BLOCK, Block, Stream, Unit
 from jaxpose.data.images import found, some
 from jaxpose.errors import DataError
@@ -36,13 +36,18 @@ def load(
     """Read an npz file with arrays x, y, t, p (or xs, ys, ts, ps), or the only one in the folder `path`.
 
     Time 0 is the first event's stamp. In the same folder may lie `poses.txt`, T_world_cam in TUM's format on
-    the clock of the events, and the camera (`event_beside.find_camera`; it also says what `size` is for).
+    the clock of the events, and the camera (`event_beside.with_camera`; it also says what `size` is for).
     What was left out or assumed is told in `notes`; `span`, `unit` and what is refused are those of
     `event_clean.clean`.
     """
-    stream = npz_stream(_file(Path(path)))
-    truth = stream.file.parent / "poses.txt"
-    return load_stream(stream, truth, mosaic=mosaic, size=size, unit=unit, span=span)[0]
+    source = find(path, size=size)
+    truth = source.stream.file.parent / "poses.txt"
+    return load_source(source, truth, mosaic=mosaic, unit=unit, span=span)[0]
+
+
+def find(path: Path | str, *, size: tuple[int, int] | None = None) -> Source:
+    """The file and the camera that `load` reads."""
+    return with_camera(npz_stream(_file(Path(path))), size)
 
 
 def npz_stream(file: Path) -> Stream:

@@ -99,6 +99,11 @@ def reach(tally: Tally) -> str:
     return f"{low}to {tally.high[0]}, {tally.high[1]}"
 
 
+def listed(polarities: frozenset[float]) -> str:
+    """Polarities in words."""
+    return " and ".join(f"{value:g}" for value in sorted(polarities))
+
+
 def find_unit(t: np.ndarray) -> Unit:
     """The unit of the stamps of consecutive events, by their size and by how many of them fall on a unit.
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxpose.camera import Camera
-from jaxpose.data.event_beside import check_mosaic
+from jaxpose.data.event_beside import Source, check_mosaic
 from jaxpose.data.event_clean import clean
 from jaxpose.data.event_npz import npz_stream
 from jaxpose.data.event_stream import Unit
@@ -64,10 +64,7 @@ def load(
     with all events read. DataError naming the file for anything else that cannot be used.
     """
     check_mosaic(mosaic)
-    path = Path(path)
-    split = _training(path)
-    if split is None:
-        raise DataError(f"{path}: expected {_LAYOUT}, got {found(path)}")
+    split = _split(Path(path))
     views = _read_views(split, size)
     camera = views.camera
     stream = npz_stream(_event_file(split))
@@ -95,6 +92,21 @@ def load(
         held_out=held_out,
         notes=(*views.notes, *told, f"views taken as evenly spaced in time; {turn}", *lacking),
     )
+
+
+def find(path: Path | str, *, size: tuple[int, int] | None = None) -> Source:
+    """The file and the camera that `load` reads."""
+    split = _split(Path(path))
+    views = _read_views(split, size)
+    return Source(npz_stream(_event_file(split)), views.camera, views.notes)
+
+
+def _split(path: Path) -> Path:
+    """The folder of the views that have events."""
+    split = _training(path)
+    if split is None:
+        raise DataError(f"{path}: expected {_LAYOUT}, got {found(path)}")
+    return split
 
 
 def _training(path: Path) -> Path | None:
