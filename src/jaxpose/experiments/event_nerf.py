@@ -18,7 +18,7 @@ import numpy as np
 
 from jaxpose import command, io, io_checkpoint, metrics, plots_events, plots_nerf
 from jaxpose.experiments import joint_loop
-from jaxpose.experiments.event_nerf_measure import PROTOCOL, Measured, measure, some
+from jaxpose.experiments.event_nerf_measure import PROTOCOL, Measured, Truth, find_truth, measure
 from jaxpose.experiments.event_nerf_options import Config, Problem, Study, decisive, load
 from jaxpose.experiments.event_nerf_report import Progress, progress_bar, report, table
 from jaxpose.experiments.event_nerf_setup import Setup, build, describe
@@ -125,9 +125,10 @@ def _single(
     if finished.exists():
         return json.loads(finished.read_text())
     setup = build(config, problem)
-    trained = _train(config, problem, setup, folder / "checkpoint.npz", on_progress, label)
-    measured = measure(problem, setup, trained.state)
-    _draw(folder, config, problem, measured)
+    truth = find_truth(problem)
+    trained = _train(config, problem, setup, truth, folder / "checkpoint.npz", on_progress, label)
+    measured = measure(problem, setup, trained.state, truth)
+    _draw(folder, config, problem, measured, truth)
     _write_poses(folder, problem, setup, trained.state, measured)
     seconds = float(trained.history[-1, -1])
     results = {
@@ -154,13 +155,16 @@ def _train(
     config: Config,
     problem: Problem,
     setup: Setup,
+    truth: Truth | None,
     checkpoint: Path,
     on_progress: OnProgress | None,
     label: str,
 ) -> joint_loop.Trained:
-    at = some(len(problem.recording.t))
-    truth = problem.recording.T_world_cam[at]
-    poses = joint_loop.pose_reader(setup.field, problem.recording.t[at])
+    if truth is None:
+        errors = lambda params: (np.nan, np.nan)
+    else:
+        poses = joint_loop.pose_reader(setup.field, truth.t)
+        errors = lambda params: joint_loop.mean_errors(poses(params), truth.T_world_cam)
 
     def on_row(row):
         if on_progress is not None:
@@ -171,43 +175,48 @@ def _train(
         setup.trainer,
         joint_loop.fresh(setup.trainer, setup.train.steps, config.seed),
         setup.data,
-        lambda params: metrics.pose_errors(poses(params), truth),
+        errors,
         checkpoint,
         on_row,
     )
 
 
-def _draw(folder: Path, config: Config, problem: Problem, measured: Measured) -> None:
+def _draw(folder: Path, config: Config, problem: Problem, measured: Measured, truth: Truth | None) -> None:
     numbers, about, recording = measured.numbers, problem.about, problem.recording
-    title = f"{about['data']}, {about['events']} events\n{about['poses']}"
-    found = (
-        f"{config.pose}, {config.loss} loss: translation error "
-        f"{numbers['start']['translation_error']:.4f} to {numbers['translation_error']:.4f} units, "
-        f"rotation {numbers['start']['rotation_error_deg']:.2f} to "
-        f"{numbers['rotation_error_deg']:.2f} deg"
-    )
+    title = f"{about['data']}, {about['events']} events\nposes {about['poses']}"
+    method = f"{config.pose}, {config.loss} loss"
     camera = recording.camera
     plots_events.windows(folder / "events.png", recording.events, camera.height, camera.width, title)
-    before, after = (
-        (errors.rotation_errors_deg, errors.translation_errors)
-        for errors in (measured.at_start, measured.at_end)
-    )
-    plots_events.errors(folder / "pose_errors.png", measured.t, before, after, f"{title}\n{found}")
-    if measured.views:
-        psnr = f"{config.pose}, {config.loss} loss, held-out PSNR {numbers['psnr']:.2f} dB"
-        plots_nerf.held_out(folder / "held_out.png", measured.views, f"{title}\n{psnr}")
+    if truth is not None and measured.at_start is not None and measured.at_end is not None:
+        before, after = (
+            (errors.rotation_errors_deg, errors.translation_errors)
+            for errors in (measured.at_start, measured.at_end)
+        )
+        found = (
+            f"{method}: translation error {numbers['start']['translation_error']:.4f} to "
+            f"{numbers['translation_error']:.4f} units, rotation "
+            f"{numbers['start']['rotation_error_deg']:.2f} to {numbers['rotation_error_deg']:.2f} deg"
+        )
+        plots_events.errors(folder / "pose_errors.png", truth.t, before, after, f"{title}\n{found}")
+    for views, name in ((measured.held_out, "held_out"), (measured.frames, "frames")):
+        if views:
+            psnr = numbers["psnr"] if name == "held_out" else numbers["frames"]["psnr"]
+            plots_nerf.held_out(folder / f"{name}.png", views, f"{title}\n{method}, PSNR {psnr:.2f} dB")
 
 
 def _write_poses(folder: Path, problem: Problem, setup: Setup, state: State, measured: Measured) -> None:
-    """The trajectory, aligned with the data's own world, at its stamps and as one continuous field."""
-    recording = problem.recording
-    io.write_tum(folder / "trajectory.txt", io.Trajectory(recording.t, measured.T_estimate))
-    io.write_tum(folder / "reference.txt", io.Trajectory(recording.t, recording.T_world_cam))
-    with io.atomic(folder / "start.npz") as temporary:
-        np.savez(temporary, t=recording.t, T_world_cam=problem.T_start)
-    write_field(
-        folder / "field.npz", setup.span, setup.factors(state.pose), alignment=measured.at_end.alignment
-    )
+    """The trajectory, aligned with the truth where there is any, at its stamps and as a continuous field."""
+    recording, (first, last) = problem.recording, problem.span
+    t = recording.t[(recording.t >= first) & (recording.t <= last)]
+    if len(t) < 2:
+        t = np.linspace(first, last, 100)
+    else:
+        reference = recording.T_world_cam[np.isin(recording.t, t)]
+        io.write_tum(folder / "reference.txt", io.Trajectory(t, reference))
+    estimate = metrics.align(measured.alignment, joint_loop.pose_reader(setup.field, t)(state.pose))
+    io.write_tum(folder / "trajectory.txt", io.Trajectory(t, estimate))
+    io.write_tum(folder / "start.txt", problem.start)
+    write_field(folder / "field.npz", problem.span, setup.factors(state.pose), alignment=measured.alignment)
     write_camera(folder / "camera.json", recording.camera, (), ".")
 
 

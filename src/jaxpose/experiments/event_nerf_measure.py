@@ -1,25 +1,30 @@
 """How good a training on events is: pose errors over the motion, held-out views after a correction."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
-from jaxpose import metrics, nerf
+from jaxpose import events_motion, metrics, nerf
 from jaxpose.events import GAMMA, log_intensity
 from jaxpose.experiments.event_nerf_options import Problem
 from jaxpose.experiments.event_nerf_setup import Setup
 from jaxpose.experiments.joint_loop import pose_reader
 from jaxpose.experiments.noisy_nerf_measure import pose_numbers
-from jaxpose.fields import set_progress
-from jaxpose.metrics import PoseErrors
+from jaxpose.fields import PoseField, set_progress, stamped
+from jaxpose.io import Trajectory
+from jaxpose.metrics import PoseErrors, Similarity
 from jaxpose.metrics_image import lpips, ssim
 from jaxpose.nerf import TrainConfig
 from jaxpose.plots_nerf import HeldOut
+from jaxpose.recording import Photographs, take
 from jaxpose.train import State
 
 _MOST_POSES = 200  # at which errors are measured
+_MULTIPLES = (-1.0, 0.0, 0.5, 0.8, 1.0, 1.25, 2.0)  # of the motion, along which contrast is measured
 PROTOCOL = {
     "alignment": "similarity that maps estimated camera centres to the true ones (scale: ratio of spreads)",
     "rotation_error_deg": "angle to the true orientation after alignment, mean over at most 200 true poses "
@@ -30,41 +35,79 @@ PROTOCOL = {
     "psnr, ssim, lpips": "mean over the held-out views, their true poses brought into the estimate's frame "
     "by the alignment, no test-time optimisation; first slope and offset of log intensity are fitted for "
     "each colour over all views, as EventNeRF does",
+    "frames": "the same numbers for the camera's own images during the events, rendered at their stamps",
+    "slide": "way of the camera from first to last event in its own axes and its angle to the true way; "
+    "variance of the warped events along multiples of that way, depths as rendered",
 }
 
 
+class Truth(NamedTuple):
+    """Some of the true poses during the events, and where the training starts at the same instants."""
+
+    t: Float[np.ndarray, " m"]
+    T_world_cam: Float[np.ndarray, "m 4 4"]
+    T_start: Float[np.ndarray, "m 4 4"]
+
+
 class Measured(NamedTuple):
-    """The numbers, the held-out views to draw, and errors over time."""
+    """The numbers, views to draw beside photographs, and where there is truth errors over time."""
 
     numbers: dict[str, Any]
-    views: list[HeldOut]
-    t: Float[np.ndarray, " m"]
-    at_start: PoseErrors
-    at_end: PoseErrors
-    T_estimate: Float[np.ndarray, "k 4 4"]  # at all the recording's stamps, aligned with the truth
+    held_out: list[HeldOut]
+    frames: list[HeldOut]  # the camera's own
+    at_start: PoseErrors | None
+    at_end: PoseErrors | None
+    alignment: Similarity  # of the estimate with the truth; none where there is no truth
 
 
-def some(count: int) -> np.ndarray:
-    """Which of so many poses are measured."""
-    return np.unique(np.linspace(0, count - 1, min(count, _MOST_POSES)).round().astype(int))
+def find_truth(problem: Problem) -> Truth | None:
+    """None where fewer than three true poses are known during the events: an alignment would fit anything."""
+    recording, (first, last) = problem.recording, problem.span
+    during = np.flatnonzero((recording.t >= first) & (recording.t <= last))
+    if len(during) < 3:
+        return None
+    at = during[np.unique(np.linspace(0, len(during) - 1, min(len(during), _MOST_POSES)).round().astype(int))]
+    start = PoseField(lambda key: (), lambda params, t: stamped(*_arrays(problem.start))(t))
+    return Truth(recording.t[at], recording.T_world_cam[at], pose_reader(start, recording.t[at])(()))
 
 
-def measure(problem: Problem, setup: Setup, state: State) -> Measured:
-    """Errors of the trained trajectory, and of what the scene shows from held-out poses."""
-    recording = problem.recording
-    at = some(len(recording.t))
-    truth = recording.T_world_cam[at]
-    T_world_cam = pose_reader(setup.field, recording.t)(state.pose)
-    errors = metrics.pose_errors(T_world_cam[at], truth)
-    at_start = metrics.pose_errors(problem.T_start[at], truth)
-    views, seen = _held_out(problem, setup, state, truth, T_world_cam[at])
-    numbers = {
-        **pose_numbers(errors, problem.extent),
-        **seen,
-        "start": pose_numbers(at_start, problem.extent),
-    }
-    aligned = metrics.align(errors.alignment, T_world_cam)
-    return Measured(numbers, views, recording.t[at], at_start, errors, aligned)
+def measure(problem: Problem, setup: Setup, state: State, truth: Truth | None) -> Measured:
+    """Errors of the trained trajectory, what the scene shows, and how sharp the motion makes the events."""
+    scene = set_progress(state.scene, jnp.ones(()))
+    look = lambda camera, samples: nerf.viewer(
+        setup.scene, camera, problem.depths, TrainConfig(steps=1, rays=1, samples=samples, chunk=64),
+        background=problem.background,
+    ).image  # fmt: skip
+    samples = 2 * setup.train.samples
+    camera, recording = problem.recording.camera, problem.recording
+    at_start = at_end = None
+    numbers: dict[str, Any] = {}
+    to_truth = Similarity(1.0, np.eye(3), np.zeros(3))
+    views, seen = [], {"psnr": None, "ssim": None, "lpips": None}
+    if truth is not None:
+        estimate = pose_reader(setup.field, truth.t)(state.pose)
+        at_end = metrics.pose_errors(estimate, truth.T_world_cam)
+        at_start = metrics.pose_errors(truth.T_start, truth.T_world_cam)
+        extent = problem.about["extent"]
+        numbers = pose_numbers(at_end, extent) | {"start": pose_numbers(at_start, extent)}
+        to_truth = at_end.alignment
+        if recording.held_out is not None:
+            to_estimate = metrics.procrustes(truth.T_world_cam, estimate)
+            poses = metrics.align(to_estimate, recording.held_out.T_world_cam)
+            views = _seen(look(recording.held_out.camera, samples), scene, recording.held_out, poses, setup)
+            seen = _alike(views)
+    numbers |= seen
+    frames = []
+    if recording.frames is not None:
+        inside = (recording.frames.t >= problem.span[0]) & (recording.frames.t <= problem.span[1])
+        photographs = take(recording.frames, np.flatnonzero(inside))
+        if len(photographs.t):
+            poses = pose_reader(setup.field, photographs.t)(state.pose)
+            frames = _seen(look(camera, samples), scene, photographs, poses, setup)
+            numbers["frames"] = _alike(frames)
+    if problem.slides:
+        numbers["slide"] = _slide(problem, setup, state, scene, truth, look(camera, samples))
+    return Measured(numbers, views, frames, at_start, at_end, to_truth)
 
 
 def corrected(
@@ -84,39 +127,74 @@ def corrected(
     return result
 
 
-def _held_out(
-    problem: Problem,
+def _seen(
+    image: Callable[..., Any],
+    scene: Any,
+    photographs: Photographs,
+    poses: Float[np.ndarray, "n 4 4"],
     setup: Setup,
-    state: State,
-    truth: Float[np.ndarray, "m 4 4"],
-    estimate: Float[np.ndarray, "m 4 4"],
-) -> tuple[list[HeldOut], dict[str, float | None]]:
-    held_out = problem.recording.held_out
-    if held_out is None:
-        return [], {"psnr": None, "ssim": None, "lpips": None}
-    to_estimate = metrics.procrustes(truth, estimate)
-    config = TrainConfig(steps=1, rays=1, samples=2 * setup.train.samples, chunk=64)
-    viewer = nerf.viewer(
-        setup.scene, held_out.camera, setup.depths, config, background=problem.background
-    )  # fmt: skip
-    scene = set_progress(state.scene, jnp.ones(()))
-    rendered = [
-        viewer.image(scene, jnp.asarray(T, jnp.float32))
-        for T in metrics.align(to_estimate, held_out.T_world_cam)
-    ]
-    photographs = held_out.rgb / 255
+) -> list[HeldOut]:
+    """What the scene shows from poses beside photographs, its log intensity corrected to theirs."""
+    rendered = [image(scene, jnp.asarray(T, jnp.float32)) for T in poses]
     rgb = np.clip(np.stack([np.asarray(colour, np.float64) for colour, _ in rendered]), 0, 1)
-    rgb = corrected(rgb, photographs, setup.train.offset)
-    views = [
-        HeldOut(name, photograph, image, np.asarray(depth, np.float64))
-        for name, photograph, image, (_, depth) in zip(
-            held_out.files, held_out.rgb, rgb, rendered, strict=True
+    rgb = corrected(rgb, photographs.rgb / 255, setup.train.offset)
+    return [
+        HeldOut(name, photograph, colour, np.asarray(depth, np.float64))
+        for name, photograph, colour, (_, depth) in zip(
+            photographs.files, photographs.rgb, rgb, rendered, strict=True
         )
     ]
-    pairs = list(zip(rgb, photographs, strict=True))
+
+
+def _alike(views: list[HeldOut]) -> dict[str, float | None]:
+    """Means over views."""
+    pairs = [(view.rendered_rgb, view.rgb / 255) for view in views]
     perceptual = [value for image, photograph in pairs if (value := lpips(image, photograph)) is not None]
-    return views, {
+    return {
         "psnr": float(np.mean([metrics.psnr(*pair) for pair in pairs])),
         "ssim": float(np.mean([ssim(*pair) for pair in pairs])),
         "lpips": float(np.mean(perceptual)) if perceptual else None,
     }
+
+
+def _slide(
+    problem: Problem, setup: Setup, state: State, scene: Any, truth: Truth | None, image: Callable[..., Any]
+) -> dict[str, Any]:
+    """The direction of a short motion against the truth's, and contrasts along multiples of the motion.
+
+    Events are carried by the scene's own depth from the middle of the time.
+    """
+    first, last = problem.span
+    ends = np.array([first, (first + last) / 2, last])
+    T_first, T_middle, T_last = pose_reader(setup.field, ends)(state.pose)
+    way = T_middle[:3, :3].T @ (T_last[:3, 3] - T_first[:3, 3])
+    recording = problem.recording
+    _, depth = image(scene, jnp.asarray(T_middle, jnp.float32))
+    nearness = 1 / np.maximum(np.asarray(depth), 1e-3)[recording.events.y, recording.events.x]
+    located = events_motion.locate(recording.camera, recording.events)
+    contrast = jax.jit(
+        lambda way: jnp.var(
+            events_motion.warped(recording.camera, located, jnp.asarray(nearness), way / (last - first))
+        )
+    )
+    result: dict[str, Any] = {
+        "way": way,
+        "contrast": {f"{k:g}": float(contrast(jnp.asarray(k * way, jnp.float32))) for k in _MULTIPLES},
+    }
+    if truth is None:
+        return result
+    T_true = truth.T_world_cam
+    true_way = T_true[len(T_true) // 2, :3, :3].T @ (T_true[-1, :3, 3] - T_true[0, :3, 3])
+    begins = problem.start.T[-1, :3, 3] - problem.start.T[0, :3, 3]
+    return result | {
+        "direction_error_deg": _angle_deg(way, true_way),
+        "start_direction_error_deg": _angle_deg(begins, true_way),
+    }
+
+
+def _angle_deg(a: Float[np.ndarray, "3"], b: Float[np.ndarray, "3"]) -> float:
+    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
+
+
+def _arrays(start: Trajectory) -> list[Float[Array, "..."]]:
+    return [jnp.asarray(x, jnp.float32) for x in start]

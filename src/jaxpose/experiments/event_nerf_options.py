@@ -14,7 +14,10 @@ from jaxpose.data import event_orbit, event_recordings
 from jaxpose.data.orbit import DIAMETER, FAR, NEAR
 from jaxpose.errors import DataError
 from jaxpose.events import Mosaic
+from jaxpose.events_motion import find_slide
 from jaxpose.experiments.joint_loop import CHUNK, NetConfig
+from jaxpose.io import Trajectory
+from jaxpose.nerf import Depths
 from jaxpose.nerf_events import Loss
 from jaxpose.recording import EventRecording
 
@@ -36,6 +39,9 @@ class Config:
     preset: Literal["fast", "paper"] = (
         "fast"  # a small network for CPUs, or the sizes of EventNeRF and the paper
     )
+    # "unknown": nothing is known of the poses; the start is the steady slide along the image that makes the
+    # events sharpest, so that the recording must be short, and lengths are in typical depths.
+    poses: Literal["known", "unknown"] = "known"
     # Instants at which positions are known, straight lines between; orientations are kept. None: all that the
     # data have; the orbit's default is 10, unless its axis is wrong.
     known: int | None = None
@@ -67,6 +73,10 @@ class Config:
             raise ValueError(f"--axis-offset-deg: expected less than 45, got {self.axis_offset_deg:g}")
         if self.steps is not None and self.steps % CHUNK:
             raise ValueError(f"--steps: expected a multiple of {CHUNK}, got {self.steps}")
+        if self.poses == "unknown" and (self.known is not None or self.axis_offset_deg):
+            raise ValueError("--poses unknown: expected neither --known nor --axis-offset-deg with it")
+        if self.poses == "unknown" and self.data == ORBIT:
+            raise ValueError("--poses unknown: expected --data with a short recording, got the orbit")
         if self.resume and self.out is None and self.name is None:
             raise ValueError("--resume: expected --out DIR or --name NAME with it")
 
@@ -81,15 +91,16 @@ def decisive(config: Config) -> dict[str, Any]:
 
 
 class Problem(NamedTuple):
-    """Events, and the poses that the training starts from, at the recording's stamps."""
+    """Events, and stamped poses that the training starts from."""
 
     recording: EventRecording
-    T_start: Float[np.ndarray, "k 4 4"]
+    start: Trajectory
+    span: tuple[float, float]  # [s] events are used, and poses asked for
     threshold: float
-    near: float  # z-depths between which the scene lies [scene units]
-    far: float
+    depths: Depths
     background: float | None
-    extent: float  # largest distance between true cameras [scene units]
+    extent: float  # how far the camera moves [scene units]
+    slides: bool  # whether nothing is known but that it slides
     about: dict[str, Any]  # the data and what is wrong with the poses, in words and numbers
 
 
@@ -103,22 +114,18 @@ def load(config: Config) -> Problem:
         width = _SMOKE_WIDTH if config.smoke else config.image_width or _WIDTH
         poses = _SMOKE_POSES if config.smoke else 1000
         recording = event_orbit.event_orbit(width, config.seed, poses=poses, mosaic=config.mosaic or "rggb")
-        near, far, background = NEAR, FAR, event_orbit.BACKGROUND
     else:
         recording = event_recordings.load(config.data, mosaic=config.mosaic)
-        if len(recording.t) < 2:
-            raise DataError(f"{config.data}: expected poses at 2 instants or more, got {len(recording.t)}")
-        near, far, background = _depths(recording)
     if len(recording.events.t) == 0:
         raise DataError(f"{config.data}: expected events, got none")
-    known = config.known
-    if known is None and orbiting and not config.axis_offset_deg:
-        known = _KNOWN
-    if known is not None and known > len(recording.t):
-        raise DataError(f"--known: expected at most the {len(recording.t)} poses of the data, got {known}")
-    T_start, words = _inexact(recording, known, config.axis_offset_deg)
-    centres = recording.T_world_cam[:, :3, 3]
-    thinned = centres[:: max(1, len(centres) // 200)]
+    began = _unknown(recording) if config.poses == "unknown" else _known(config, recording, orbiting)
+    t = recording.events.t
+    span = float(max(t[0], began.start.t[0])), float(min(t[-1], began.start.t[-1]))
+    if not span[0] < span[1]:
+        raise DataError(
+            f"{config.data}: expected poses during the events, 0 to {t[-1]:.4g} s, got some from "
+            f"{began.start.t[0]:.4g} to {began.start.t[-1]:.4g} s"
+        )
     camera = recording.camera
     about = {
         "data": "synthetic orbit with events" if orbiting else recording.name,
@@ -126,12 +133,73 @@ def load(config: Config) -> Problem:
         "span_s": float(np.ptp(recording.events.t)),
         "size": (camera.width, camera.height),
         "mosaic": recording.mosaic,
-        "extent": DIAMETER if orbiting else float(pdist(thinned).max()),
-        "poses": words,
+        "extent": began.extent,
+        "poses": began.words,
         "notes": recording.notes,
     }
     threshold = config.threshold or recording.threshold or 0.25
-    return Problem(recording, T_start, threshold, near, far, background, about["extent"], about)
+    background = event_orbit.BACKGROUND if recording.cyclic else None  # EventNeRF's, for its turntables
+    return Problem(
+        recording,
+        began.start,
+        span,
+        threshold,
+        began.depths,
+        background,
+        began.extent,
+        config.poses == "unknown",
+        about,
+    )
+
+
+class _Began(NamedTuple):
+    """Where a training starts, and how large the scene is."""
+
+    start: Trajectory
+    depths: Depths
+    extent: float
+    words: str
+
+
+def _unknown(recording: EventRecording) -> _Began:
+    """The slide that makes events sharpest, from the middle of the time at the world's origin."""
+    slide = find_slide(recording.camera, recording.events)
+    ends = recording.events.t[[0, -1]]
+    T_start = np.tile(np.eye(4), (2, 1, 1))
+    T_start[:, :3, 3] = (ends - ends.mean())[:, None] * slide.velocity
+    depths = 1 / slide.inverse_depth
+    x, y, _ = slide.velocity
+    words = f"unknown: starts as a steady slide of ({x:.3g}, {y:.3g}) typical depths a second, by contrast"
+    return _Began(
+        Trajectory(ends, T_start),
+        Depths(0.6 * float(depths.min()), 2 * float(depths.max()), "disparity"),
+        float(np.linalg.norm(T_start[1, :3, 3] - T_start[0, :3, 3])),
+        words,
+    )
+
+
+def _known(config: Config, recording: EventRecording, orbiting: bool) -> _Began:
+    """The recording's poses with what is said to be wrong with them."""
+    if len(recording.t) < 2:
+        raise DataError(
+            f"{config.data}: expected poses at 2 instants or more, or --poses unknown, got {len(recording.t)}"
+        )
+    known = config.known
+    if known is None and orbiting and not config.axis_offset_deg:
+        known = _KNOWN
+    if known is not None and known > len(recording.t):
+        raise DataError(f"--known: expected at most the {len(recording.t)} poses of the data, got {known}")
+    T_start, words = _inexact(recording, known, config.axis_offset_deg)
+    centres = recording.T_world_cam[:, :3, 3]
+    extent = DIAMETER if orbiting else float(pdist(centres[:: max(1, len(centres) // 200)]).max())
+    if orbiting:
+        depths = Depths(NEAR, FAR)
+    elif recording.held_out is not None:
+        depths = Depths(recording.held_out.near, recording.held_out.far)
+    else:  # EventNeRF's rule: the scene lies in the unit sphere about the world's origin
+        distance = np.linalg.norm(centres, axis=1)
+        depths = Depths(max(distance.min() - 1, 0.05 * distance.min()), distance.max() + 1)
+    return _Began(Trajectory(recording.t, T_start), depths, extent, words)
 
 
 def _inexact(
@@ -152,11 +220,3 @@ def _inexact(
         )
         words.append(f"axis wrong by {offset_deg:g} degrees about the camera's y axis")
     return T_start, ", ".join(words)
-
-
-def _depths(recording: EventRecording) -> tuple[float, float, float | None]:
-    """Where the scene lies: as the held-out views say, or within a unit sphere about the world's origin."""
-    if recording.held_out is not None:
-        return recording.held_out.near, recording.held_out.far, event_orbit.BACKGROUND
-    distance = np.linalg.norm(recording.T_world_cam[:, :3, 3], axis=1)
-    return max(float(distance.min()) - 1, 0.05 * float(distance.min())), float(distance.max()) + 1, None

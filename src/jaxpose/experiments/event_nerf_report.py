@@ -40,19 +40,18 @@ def progress_bar() -> Callable[[Progress], None]:
 
 
 def table(runs: dict[str, dict[str, Any]]) -> str:
-    """Results side by side, in Markdown."""
+    """Results side by side, in Markdown; n/a where there is nothing to compare with."""
     rows = [_COLUMNS] + [
         (
             label,
-            f"{run['start']['rotation_error_deg']:.3f}",
-            f"{run['rotation_error_deg']:.3f}",
-            f"{run['start']['translation_error']:.4f}",
-            f"{run['translation_error']:.4f}",
-            f"{run['translation_error_percent']:.3f}",
-            *(
-                "n/a" if run[name] is None else f"{run[name]:.{digits}f}"
-                for name, digits in (("psnr", 2), ("ssim", 3), ("lpips", 3))
-            ),
+            _number(run.get("start", {}).get("rotation_error_deg"), 3),
+            _number(run.get("rotation_error_deg"), 3),
+            _number(run.get("start", {}).get("translation_error"), 4),
+            _number(run.get("translation_error"), 4),
+            _number(run.get("translation_error_percent"), 3),
+            _number(run["psnr"], 2),
+            _number(run["ssim"], 3),
+            _number(run["lpips"], 3),
             f"{run['train_s']:.0f}",
         )
         for label, run in runs.items()
@@ -82,8 +81,33 @@ def report(folder: Path, results: dict[str, Any]) -> str:
         f"{data['extent']:.3g}",
         f"  alignment    {protocol['alignment']}",
         f"  PSNR ...     {protocol['psnr, ssim, lpips']}",
+        *(line for run in runs.values() for line in _beside(run)),
         f"  cost         {results['wall_s']:.0f} s in all, "
         f"{results['peak_rss_bytes'] / 2**30:.2f} GiB of memory at most",
         f"  written to   {folder}",
     ]
     return "\n".join(lines)
+
+
+def _beside(run: dict[str, Any]) -> list[str]:
+    """What only some data have: the camera's own images, a motion that was not known."""
+    lines = []
+    if "frames" in run:
+        frames = run["frames"]
+        lines.append(
+            f"  frames       PSNR {frames['psnr']:.2f} dB, SSIM {frames['ssim']:.3f} beside the camera's own"
+        )
+    if "slide" in run:
+        slide = run["slide"]
+        contrasts = ", ".join(f"{value:.2f} at {k}" for k, value in slide["contrast"].items())
+        lines.append(f"  contrast     of events warped along multiples of the motion found: {contrasts}")
+        if "direction_error_deg" in slide:
+            lines.append(
+                f"  direction    {slide['direction_error_deg']:.2f} deg from the true one, "
+                f"{slide['start_direction_error_deg']:.2f} at the start"
+            )
+    return lines
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "n/a" if value is None else f"{value:.{digits}f}"

@@ -13,7 +13,6 @@ from jaxpose.experiments.event_nerf_options import Config, Problem
 from jaxpose.experiments.joint_loop import CHUNK
 from jaxpose.fields import Params, PoseField, PoseNetConfig
 from jaxpose.io_field import Factor, posenet_factor, stamped_factor
-from jaxpose.nerf import Depths
 from jaxpose.nerf_events import EventData, EventTrainConfig
 from jaxpose.scenes import NerfConfig, SceneField, nerf
 from jaxpose.train import Rate, Trainer
@@ -29,6 +28,8 @@ _SMOKE = EventTrainConfig(steps=CHUNK, events=32, samples=8, chunk=32)
 _RATES = {
     "fast": {"translation": Rate(6e-4, 2e-5, 0.03), "rotation": Rate(3e-5, 2e-6, 0.06)},
     "paper": {"translation": Rate(2e-4, 2e-6), "rotation": Rate(5e-5, 5e-7)},
+    # A short slide is a small angle: turns of its size must come as slowly as it, after the scene.
+    "unknown": {"translation": Rate(3e-4, 2e-5, 0.3), "rotation": Rate(1e-6, 1e-7, 0.3)},
 }
 
 
@@ -40,8 +41,6 @@ class Setup(NamedTuple):
     factors: Callable[[Params], tuple[Factor, ...]]  # of the field, for `io_field.write_field`
     rates: dict[str, Rate]  # of the scene and, where it moves, of the parts of the pose field
     train: EventTrainConfig
-    depths: Depths
-    span: tuple[float, float]
     trainer: Trainer
     data: EventData
 
@@ -54,21 +53,21 @@ def build(config: Config, problem: Problem) -> Setup:
     else:
         scene, train = (nerf(), _PAPER) if paper else (nerf(_FAST_SCENE), _FAST)
         train = replace(train, steps=config.steps or train.steps, events=config.events or train.events)
-    # An event whose pose is not known is not asked for.
-    t = recording.events.t
-    span = (float(max(t[0], recording.t[0])), float(min(t[-1], recording.t[-1])))
+    span = problem.span
+    # Between the two instants a pixel reports something about once, or only noise would be compared.
+    pixels = recording.camera.width * recording.camera.height
+    longest_s = min((span[1] - span[0]) * pixels / len(recording.events.t), span[1] - span[0])
     train = replace(
         train,
         loss=config.loss,
         threshold=problem.threshold,
-        longest_s=(span[1] - span[0]) / 20,
+        longest_s=longest_s,
         background=problem.background,
     )
-    depths = Depths(problem.near, problem.far)
-    field, factors, pose_rates = _field(config, problem, span)
+    field, factors, pose_rates = _field(config, problem)
     scene_rate = Rate(5e-4, 5e-4) if paper else Rate(1e-3, 1e-4)
     trainer = nerf_events.trainer(
-        scene, field, recording.camera, depths, span, scene_rate, pose_rates, train
+        scene, field, recording.camera, problem.depths, span, scene_rate, pose_rates, train
     )  # fmt: skip
     return Setup(
         scene,
@@ -76,10 +75,8 @@ def build(config: Config, problem: Problem) -> Setup:
         factors,
         {"scene": scene_rate, **pose_rates},
         train,
-        depths,
-        span,
         trainer,
-        _data(problem, span),
+        _data(problem),
     )
 
 
@@ -97,16 +94,16 @@ def describe(config: Config, setup: Setup) -> dict[str, Any]:
 
 
 def _field(
-    config: Config, problem: Problem, span: tuple[float, float]
+    config: Config, problem: Problem
 ) -> tuple[PoseField, Callable[[Params], tuple[Factor, ...]], dict[str, Rate]]:
     """The trajectory as a field and as factors of its file, and the rates of its parameters."""
-    t, T_start = (jnp.asarray(x, jnp.float32) for x in (problem.recording.t, problem.T_start))
+    t, T_start = (jnp.asarray(x, jnp.float32) for x in problem.start)
     initial, start = fields.stamped(t, T_start), stamped_factor(t, T_start)
     if config.pose == "linear":
         return PoseField(lambda key: {}, lambda params, t: initial(t)), lambda params: (start,), {}
     net = replace(config.net, layers=2, width=32) if config.smoke else config.net
-    posenet = PoseNetConfig(span=span, translation_scale=problem.extent / 2, **asdict(net))
-    rates = _RATES[config.preset]
+    posenet = PoseNetConfig(span=problem.span, translation_scale=problem.extent / 2, **asdict(net))
+    rates = _RATES["unknown" if problem.slides else config.preset]
     if config.net.coupled:
         rates = {"coupled": rates["rotation"]}
     if config.net.window is not None:
@@ -115,9 +112,9 @@ def _field(
     return field, lambda params: (posenet_factor(posenet, params), start), rates
 
 
-def _data(problem: Problem, span: tuple[float, float]) -> EventData:
+def _data(problem: Problem) -> EventData:
     """The events within the span, by pixel, on the device."""
-    recording = problem.recording
+    recording, span = problem.recording, problem.span
     width, height = recording.camera.width, recording.camera.height
     inside = (recording.events.t >= span[0]) & (recording.events.t <= span[1])
     streams = events.by_pixel(events.Events(*(column[inside] for column in recording.events)), height, width)

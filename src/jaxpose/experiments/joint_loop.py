@@ -12,10 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxpose import command, io, io_checkpoint
+from jaxpose import command, io, io_checkpoint, metrics
 from jaxpose.errors import DataError
 from jaxpose.fields import PoseField
-from jaxpose.metrics import PoseErrors
 from jaxpose.nn import Activation
 from jaxpose.train import State, Trainer
 
@@ -52,7 +51,7 @@ def train(
     trainer: Trainer,
     trained: Trained,
     data: Any,
-    errors: Callable[[Any], PoseErrors],
+    errors: Callable[[Any], tuple[float, float]],
     checkpoint: Path,
     on_row: Callable[[Float[np.ndarray, "5"]], None],
     *,
@@ -60,7 +59,8 @@ def train(
 ) -> Trained:
     """Train to the end, from the checkpoint if there is one, and keep one as it goes.
 
-    `errors` measures the parameters of the pose field, `between` changes the state after every chunk.
+    `errors` gives rotation [deg] and translation errors of the pose field's parameters, `between` changes the
+    state after every chunk.
     DataError where the loss is no longer a number.
     """
     if checkpoint.exists():
@@ -77,7 +77,7 @@ def train(
             raise DataError(f"step {step}: expected a finite loss, got {loss}")
         found = errors(state.pose)
         now = time.perf_counter()
-        history[chunk] = (step, loss, found.rotation_deg, found.translation, before + now - started)
+        history[chunk] = (step, loss, *found, before + now - started)
         if now - saved > _SAVE_EVERY_S or chunk + 1 == len(history):
             io_checkpoint.save(checkpoint, Trained(state, history))
             saved = now
@@ -101,6 +101,14 @@ def pose_reader(field: PoseField, t: Float[np.ndarray, " n"]) -> Callable[[Any],
     times = jnp.asarray(t, jnp.float32)
     compiled = jax.jit(lambda params: jax.vmap(field.pose, (None, 0))(params, times))
     return lambda params: np.asarray(compiled(params), np.float64)
+
+
+def mean_errors(
+    estimate: Float[np.ndarray, "n 4 4"], truth: Float[np.ndarray, "n 4 4"]
+) -> tuple[float, float]:
+    """Mean rotation [deg] and translation error after alignment, as `metrics.pose_errors`."""
+    found = metrics.pose_errors(estimate, truth)
+    return found.rotation_deg, found.translation
 
 
 def net_config(settings: dict[str, Any]) -> NetConfig:

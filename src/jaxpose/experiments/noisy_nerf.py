@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxpose import command, io, io_checkpoint, metrics, nerf, plots_nerf
+from jaxpose import command, io, io_checkpoint, nerf, plots_nerf
 from jaxpose.data import blender
 from jaxpose.experiments import joint_loop
 from jaxpose.experiments.joint_loop import Trained
@@ -112,7 +112,7 @@ def train(
         trainer,
         joint_loop.fresh(trainer, setup.train.steps, config.seed),
         setup.views,
-        lambda params: metrics.pose_errors(poses(params), problem.train.T_world_cam),
+        lambda params: joint_loop.mean_errors(poses(params), problem.train.T_world_cam),
         checkpoint,
         on_row,
         between=between,
