@@ -55,7 +55,7 @@ def warped(
     image is a pinhole's of the same focal length.
     """
     way = events.t * inverse_depth
-    at = (events.direction + velocity[:2] * way[:, None]) / (1 + velocity[2] * way)[:, None]
+    at = (events.direction + way[:, None] * velocity[None, :2]) / (1 + velocity[2] * way)[:, None]
     x, y = at[:, 0] * camera.fx + camera.cx, at[:, 1] * camera.fy + camera.cy
     column, row = jnp.floor(x), jnp.floor(y)
     image = jnp.zeros((camera.height, camera.width), x.dtype)
@@ -123,8 +123,9 @@ def _sampler(camera: Camera, events: Located):
     x = (events.direction[:, 0] * camera.fx + camera.cx) / camera.width * (columns - 1)
     y = (events.direction[:, 1] * camera.fy + camera.cy) / camera.height * (rows - 1)
     x, y = jnp.clip(x, 0, columns - 1.001), jnp.clip(y, 0, rows - 1.001)
-    column, row = jnp.floor(x).astype(jnp.int32), jnp.floor(y).astype(jnp.int32)
+    column, row = jnp.floor(x), jnp.floor(y)
     right, below = x - column, y - row
+    column, row = column.astype(jnp.int32), row.astype(jnp.int32)
 
     def sample(values):
         upper = values[row, column] * (1 - right) + values[row, column + 1] * right
