@@ -54,9 +54,8 @@ def build(config: Config, problem: Problem) -> Setup:
         scene, train = (nerf(), _PAPER) if paper else (nerf(_FAST_SCENE), _FAST)
         train = replace(train, steps=config.steps or train.steps, events=config.events or train.events)
     span = problem.span
-    # Between the two instants a pixel reports something about once, or only noise would be compared.
-    pixels = recording.camera.width * recording.camera.height
-    longest_s = min((span[1] - span[0]) * pixels / len(recording.events.t), span[1] - span[0])
+    # EventNeRF's windows are up to a twentieth of a turn; a slide is short as it is.
+    longest_s = (span[1] - span[0]) / (1 if problem.slides else 20)
     train = replace(
         train,
         loss=config.loss,
