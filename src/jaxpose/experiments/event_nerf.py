@@ -198,10 +198,14 @@ def _draw(folder: Path, config: Config, problem: Problem, measured: Measured, tr
             f"{numbers['start']['rotation_error_deg']:.2f} to {numbers['rotation_error_deg']:.2f} deg"
         )
         plots_events.errors(folder / "pose_errors.png", truth.t, before, after, f"{title}\n{found}")
-    for views, name in ((measured.held_out, "held_out"), (measured.frames, "frames")):
-        if views:
-            psnr = numbers["psnr"] if name == "held_out" else numbers["frames"]["psnr"]
-            plots_nerf.held_out(folder / f"{name}.png", views, f"{title}\n{method}, PSNR {psnr:.2f} dB")
+    if measured.held_out:
+        about_views = f"{title}\n{method}, held-out PSNR {numbers['psnr']:.2f} dB"
+        plots_nerf.held_out(folder / "held_out.png", measured.held_out, about_views)
+    if measured.frames:
+        about_views = f"{title}\n{method}, PSNR {numbers['frames']['psnr']:.2f} dB"
+        plots_nerf.held_out(
+            folder / "frames.png", measured.frames, about_views, photograph="the camera's own image"
+        )
 
 
 def _write_poses(folder: Path, problem: Problem, setup: Setup, state: State, measured: Measured) -> None:

@@ -20,6 +20,8 @@ from jaxpose.train import Rate, Trainer
 _FAST_SCENE = NerfConfig(
     layers=4, width=96, skip=2, colour_width=48, octaves=7, window=(0.1, 0.5), quiet=True
 )
+# A view of a slide is less than a unit wide, and what it shows is there from the start.
+_SLIDE_SCENE = replace(_FAST_SCENE, octaves=10, window=(0.05, 0.3))
 _SMOKE_SCENE = NerfConfig(layers=2, width=16, skip=None, colour_width=8, octaves=4, window=(0.1, 0.5))
 _FAST = EventTrainConfig(steps=3000, events=512, samples=32, chunk=32)
 _PAPER = EventTrainConfig(steps=200_000, events=1024, samples=192, chunk=16)
@@ -51,7 +53,9 @@ def build(config: Config, problem: Problem) -> Setup:
     if config.smoke:
         scene, train = nerf(_SMOKE_SCENE), _SMOKE
     else:
-        scene, train = (nerf(), _PAPER) if paper else (nerf(_FAST_SCENE), _FAST)
+        scene, train = (
+            (nerf(), _PAPER) if paper else (nerf(_SLIDE_SCENE if problem.slides else _FAST_SCENE), _FAST)
+        )
         train = replace(train, steps=config.steps or train.steps, events=config.events or train.events)
     span = problem.span
     # EventNeRF's windows are up to a twentieth of a turn; a slide is short as it is.
