@@ -84,7 +84,9 @@ def test_units_are_found_and_told(made, unit, word, per_second, since, rate_hz):
     assert tally.unit == unit
     assert len(notes) == 1 and notes[0].startswith(f"stamps read as {word}: {N} events in ")
     # Seconds since 1970 have no more digits in float64.
-    np.testing.assert_allclose(events.t, (ticks - ticks[0]) / 1e6, atol=3e-7 if since and unit == "s" else 1e-12)
+    np.testing.assert_allclose(
+        events.t, (ticks - ticks[0]) / 1e6, atol=3e-7 if since and unit == "s" else 1e-12
+    )
 
 
 def test_indices_of_frames_are_found_and_told(made):
@@ -184,12 +186,21 @@ def jump(t, x, y, p):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (shuffle, r"made.npz: event \d+: expected events in the order of time, got \d+ of 5000 earlier than one "),
+        (
+            shuffle,
+            r"made.npz: event \d+: expected events in the order of time, got \d+ of 5000 earlier than one ",
+        ),
         (jump, "made.npz: event 2500: expected events in the order of time, got .* by up to 0.02"),
         (put(3, 1234, 2), "made.npz: event 1234: expected polarities 0 and 1, or -1 and 1, got 2"),
         (put(3, 1234, -1), "made.npz: expected polarities 0 and 1, or -1 and 1, got -1 and 0 and 1"),
-        (put(1, slice(0, 600), 64), "made.npz: expected pixels of 64x48, got 600 of 5000 events outside, up to 64"),
-        (put(1, slice(None), -5), "expected pixels of 64x48, got 5000 of 5000 events outside, from -5, 0 to "),
+        (
+            put(1, slice(0, 600), 64),
+            "made.npz: expected pixels of 64x48, got 600 of 5000 events outside, up to 64",
+        ),
+        (
+            put(1, slice(None), -5),
+            "expected pixels of 64x48, got 5000 of 5000 events outside, from -5, 0 to ",
+        ),
     ],
 )
 def test_unusable_events_are_refused(made, change, message):
