@@ -44,7 +44,8 @@ def test_events_come_back_in_few_bytes(made):
 def test_kinds_of_numbers_and_blocks_change_nothing(made, kinds, step):
     few = [column[:300] for column in made]
     expected = clean(stream_of(*few), SIZE, unit="us").events
-    found = clean(stream_of(*(c.astype(k) for c, k in zip(few, kinds)), step=step), SIZE, unit="us").events
+    others = [column.astype(kind) for column, kind in zip(few, kinds, strict=True)]
+    found = clean(stream_of(*others, step=step), SIZE, unit="us").events
     for a, b in zip(found, expected, strict=True):
         np.testing.assert_array_equal(a, b)
 
