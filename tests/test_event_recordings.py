@@ -70,8 +70,7 @@ def test_archives_alone_are_told_of(made):
     for name in ("poses.txt", "camera.json"):
         (folder / name).unlink()
     data = columns()
-    data["x"][0], data["y"][0] = 639, 470
-    data["x"][1:40] = 300
+    data["x"][:60], data["y"][:60] = 639, 470  # 2%: more than false ones
     write(data)
     recording = load(folder)
     assert recording.camera == (640, 640, 319.5, 239.5, 640, 480, ())
@@ -127,7 +126,7 @@ def test_npz_of_other_names_compressed_and_damaged(tmp_path):
     np.savez_compressed(tmp_path / "a.npz", **{f"{name}s": values for name, values in raw.items()})
     recording = event_npz.load(tmp_path, size=(64, 48))
     np.testing.assert_array_equal(recording.events.x, raw["x"])
-    assert recording.notes[-2].startswith("stamps read as microseconds: 3000 events in 0.2")
+    assert recording.notes[-2].startswith("stamps read as microseconds: 3000 events in 0.1999 s")
     np.savez(tmp_path / "a.npz", t=raw["t"], x=raw["x"])
     for path in (tmp_path, tmp_path / "a.npz"):
         with pytest.raises(
@@ -176,14 +175,13 @@ def test_formats_are_told_by_their_files(tmp_path):
         (tmp_path / "train" / name).mkdir(parents=True)
     assert event_recordings.find_format(tmp_path) == "eventnerf"
     (tmp_path / "none/a").mkdir(parents=True)
-    for path, found in (
+    folders = (
         (tmp_path / "none", "a"),
         (tmp_path / "none/a", "an empty folder"),
-        ("nowhere", "nothing"),
-    ):
-        with pytest.raises(
-            DataError, match=f"{path}: expected a recording of events, .*got {found}$"
-        ) as error:
+        (tmp_path / "no", "nothing"),
+    )
+    for path, got in folders:
+        with pytest.raises(DataError, match=f"{path}: expected a recording of events, .*got {got}$") as error:
             event_recordings.load(path)
         assert all(name in str(error.value) for name in ("eventnerf", "davis", "hdf5", "npz"))
 
