@@ -5,7 +5,7 @@ import zlib
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
-from typing import IO
+from typing import Any
 
 import numpy as np
 
@@ -86,7 +86,7 @@ def _blocks(file: Path) -> Iterator[Block]:
             if names is None:
                 got = some(sorted(members)) or "none"
                 raise DataError(f"{file}: expected arrays x y t p (or xs ys ts ps), got {got}")
-            columns = [stack.enter_context(archive.open(f"{name}.npy")) for name in names]
+            columns: list[Any] = [stack.enter_context(archive.open(f"{name}.npy")) for name in names]
             kinds, lengths = zip(
                 *(_header(file, *pair) for pair in zip(names, columns, strict=True)), strict=True
             )
@@ -103,7 +103,7 @@ def _blocks(file: Path) -> Iterator[Block]:
         raise DataError(f"{file}: expected a whole npz file, got {' '.join(str(error).split())}") from None
 
 
-def _header(file: Path, name: str, column: IO[bytes]) -> tuple[np.dtype, int]:
+def _header(file: Path, name: str, column: zipfile.ZipExtFile) -> tuple[np.dtype, int]:
     """Kind of number and length of an array."""
     version = np.lib.format.read_magic(column)
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
@@ -113,7 +113,7 @@ def _header(file: Path, name: str, column: IO[bytes]) -> tuple[np.dtype, int]:
     return kind, shape[0]
 
 
-def _rows(column: IO[bytes], kind: np.dtype, rows: int) -> np.ndarray:
+def _rows(column: zipfile.ZipExtFile, kind: np.dtype, rows: int) -> np.ndarray:
     content = column.read(rows * kind.itemsize)
     if len(content) < rows * kind.itemsize:
         raise EOFError("an array that ends early")

@@ -12,7 +12,7 @@ from jaxpose.errors import DataError
 Unit = Literal["s", "us", "ns", "frames"]  # of stamps; "frames": indices, of which one is taken for 1 s
 
 BLOCK = 1 << 17  # events that are held in the file's own types at a time
-_SECONDS: dict[Unit, float] = {"s": 1.0, "us": 1e-6, "ns": 1e-9, "frames": 1.0}
+_PER_SECOND: dict[Unit, float] = {"s": 1.0, "us": 1e6, "ns": 1e9, "frames": 1.0}
 _RATES_HZ = (1e2, 1e10)  # of events, that a stated unit has to give
 _FEWEST = 100  # events that tell a rate, or that are whole thousands by no chance
 
@@ -67,7 +67,7 @@ def tallied(
             first = zero if zero is not None else block.t[0].item()
             tally = Tally(unit or _possible(block.t, stream.unit) or find_unit(block.t), first)
         # Integers as integers: float64 has not the digits for nanoseconds since 1970.
-        t = (block.t - block.t.dtype.type(tally.zero)).astype(np.float64) * _SECONDS[tally.unit]
+        t = (block.t - block.t.dtype.type(tally.zero)).astype(np.float64) / _PER_SECOND[tally.unit]
         block = block._replace(t=t)
         tally = _add(tally, block, size, seen)
         seen += len(t)
@@ -128,7 +128,7 @@ def find_unit(t: np.ndarray) -> Unit:
 
 def seconds(tally: Tally) -> float:
     """Time 0 on the clock of the file [s]."""
-    return float(tally.zero) * _SECONDS[tally.unit]
+    return float(tally.zero) / _PER_SECOND[tally.unit]
 
 
 def _add(tally: Tally, block: Block, size: tuple[int, int], seen: int) -> Tally:
@@ -177,4 +177,4 @@ def _possible(t: np.ndarray, stated: Unit | None) -> Unit | None:
     span = float(t.max()) - float(t.min())
     if stated is None or not span or len(t) < _FEWEST:
         return stated
-    return stated if _RATES_HZ[0] <= len(t) / (span * _SECONDS[stated]) <= _RATES_HZ[1] else None
+    return stated if _RATES_HZ[0] <= len(t) / span * _PER_SECOND[stated] <= _RATES_HZ[1] else None
