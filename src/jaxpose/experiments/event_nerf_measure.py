@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from scipy.spatial.transform import Rotation
 
 from jaxpose import events_motion, metrics, nerf
 from jaxpose.events import GAMMA, log_intensity
@@ -29,6 +30,8 @@ PROTOCOL = {
     "alignment": "similarity that maps estimated camera centres to the true ones (scale: ratio of spreads)",
     "rotation_error_deg": "angle to the true orientation after alignment, mean over at most 200 true poses "
     "evenly over the motion",
+    "constant_rotation_error_deg": "angle of the mean turn from true to estimated orientation, in the "
+    "camera's axes: what is left of a wrong axis' offset",
     "translation_error": "distance of world-to-camera translation vectors after alignment, mean over the "
     "same, as BARF defines it [scene units]",
     "centre_error": "distance of camera centres after alignment, mean over the same [scene units]",
@@ -90,6 +93,9 @@ def measure(problem: Problem, setup: Setup, state: State, truth: Truth | None) -
         at_start = metrics.pose_errors(truth.T_start, truth.T_world_cam)
         extent = problem.about["extent"]
         numbers = pose_numbers(at_end, extent) | {"start": pose_numbers(at_start, extent)}
+        numbers["constant_rotation_error_deg"] = constant_rotation_deg(
+            metrics.align(at_end.alignment, estimate), truth.T_world_cam
+        )
         to_truth = at_end.alignment
         if recording.held_out is not None:
             to_estimate = metrics.procrustes(truth.T_world_cam, estimate)
@@ -108,6 +114,12 @@ def measure(problem: Problem, setup: Setup, state: State, truth: Truth | None) -
     if problem.slides:
         numbers["slide"] = _slide(problem, setup, state, scene, truth, look(camera, samples))
     return Measured(numbers, views, frames, at_start, at_end, to_truth)
+
+
+def constant_rotation_deg(estimate: Float[np.ndarray, "m 4 4"], truth: Float[np.ndarray, "m 4 4"]) -> float:
+    """Angle of the mean turn from true to estimated orientations, in camera axes: what a wrong axis leaves."""
+    turns = np.swapaxes(truth[:, :3, :3], 1, 2) @ estimate[:, :3, :3]
+    return float(np.degrees(Rotation.from_matrix(turns).mean().magnitude()))
 
 
 def corrected(

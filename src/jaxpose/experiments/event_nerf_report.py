@@ -92,6 +92,10 @@ def report(folder: Path, results: dict[str, Any]) -> str:
 def _beside(run: dict[str, Any]) -> list[str]:
     """What only some data have: the camera's own images, a motion that was not known."""
     lines = []
+    if "axis wrong" in run["data"]["poses"]:
+        lines.append(
+            f"  axis         off by {run['constant_rotation_error_deg']:.2f} deg as found (mean turn)"
+        )
     if "frames" in run:
         frames = run["frames"]
         lines.append(

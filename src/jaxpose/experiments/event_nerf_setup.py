@@ -111,8 +111,9 @@ def _field(
         rates = {"coupled": rates["rotation"]}
     if config.net.window is not None:
         rates = rates | {"progress": Rate(1.0, 1.0)}
-    field = fields.refine(fields.posenet(posenet), initial, side="world")
-    return field, lambda params: (posenet_factor(posenet, params), start), rates
+    # On the camera's side a wrong axis is a constant, and a chord of the circle comes near and goes away.
+    field = fields.refine(fields.posenet(posenet), initial, side="body")
+    return field, lambda params: (start, posenet_factor(posenet, params)), rates
 
 
 def _data(problem: Problem) -> EventData:
