@@ -14,7 +14,7 @@ import viser
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from jaxpose.commands.view_scene import Scene
+from jaxpose.commands.view_scene import WIDTH, Picture, Scene
 from jaxpose.errors import DataError
 from jaxpose.io import atomic
 
@@ -26,7 +26,8 @@ def serve(scene: Scene, host: str, port: int) -> tuple[int, Callable[[], None]]:
     """Show the scene at a port, or at the next free one, which is returned with what ends it."""
     server = _server(host, port)
     try:
-        stop = _panel(server, scene, _draw(server, scene))
+        picture = None if scene.render is None else scene.render(0.0, WIDTH)
+        stop = _panel(server, scene, _draw(server, scene, picture), picture)
     except BaseException:
         _stop(server)
         raise
@@ -42,14 +43,14 @@ def save(scene: Scene, file: Path) -> None:
     """Write the scene as one HTML file that plays the camera's way, as fast as it was."""
     server = _server("127.0.0.1", 0)
     try:
-        camera = _draw(server, scene)
+        camera = _draw(server, scene, None)
         recording = server.get_scene_serializer()
         last = float(scene.t[-1])
         count = min(_SAVED_FRAMES, max(2, round(30 * last)))
         for t in np.linspace(0, last, count):
             _move(camera, scene, float(t))
             if scene.render is not None:
-                camera.image = scene.render(float(t))
+                camera.image = scene.render(float(t), WIDTH)
             recording.insert_sleep(last / (count - 1))
         page = recording.as_html()
     finally:
@@ -69,20 +70,16 @@ def _stop(server: viser.ViserServer) -> None:
         server.stop()
 
 
-def _draw(server: viser.ViserServer, scene: Scene) -> Any:
+def _draw(server: viser.ViserServer, scene: Scene, picture: Picture | None) -> Any:
     """Everything that stands still, and the camera that the slider moves, which is returned."""
     path, add = scene.path, server.scene
-    low, high = path.min(axis=0), path.max(axis=0)
-    size = float(np.linalg.norm(high - low)) or 1.0  # of the path
     add.set_up_direction(tuple(scene.up))
-    centre = (low + high) / 2
-    if scene.surface is not None:
-        corners = _surface(add, scene.surface)
-        centre, size_of_all = corners.mean(axis=0), float(np.linalg.norm(corners[1] - corners[0]))
-    else:
-        size_of_all = size
-    frustum = max(0.05 * size, 0.02 * size_of_all)
-    thickness = 0.003 * size_of_all
+    surface = path[:0] if scene.surface is None else _surface(add, scene.surface)
+    low, high = np.percentile(surface, [2, 98], axis=0) if len(surface) else (path.min(0), path.max(0))
+    centre, size_of_all = (low + high) / 2, float(np.linalg.norm(high - low)) or 1.0
+    size = float(np.linalg.norm(np.ptp(path, axis=0)))
+    frustum = max(0.035 * size, 0.012 * size_of_all)
+    thickness = 0.0015 * size_of_all
     _line(add, "/estimate", path, _ESTIMATE, thickness)
     if scene.reference is not None:
         _line(add, "/truth", scene.reference, _TRUTH, thickness)
@@ -91,7 +88,7 @@ def _draw(server: viser.ViserServer, scene: Scene) -> Any:
             "/keyframes",
             scene.keyframes.astype(np.float32),
             _KEYFRAME,
-            point_size=3 * thickness,
+            point_size=2.5 * thickness,
             point_shape="circle",
             precision="float32",
         )
@@ -100,23 +97,25 @@ def _draw(server: viser.ViserServer, scene: Scene) -> Any:
     add.add_frame("/frames", show_axes=False)
     for number, shot in enumerate(scene.shots):
         add.add_camera_frustum(
-            f"/frames/{number:04d}", fov, aspect, scale=frustum, thickness=0.3 * thickness, color=_ESTIMATE,
+            f"/frames/{number:04d}", fov, aspect, scale=frustum, thickness=0.5 * thickness, color=_ESTIMATE,
             image=shot.rgb, **_placed(shot.T_world_cam),
         )  # fmt: skip
-    eye, target = _overview(scene.up, centre, size_of_all)
-    server.initial_camera.position, server.initial_camera.look_at = eye, target
+    server.initial_camera.position = centre + size_of_all * _overview(scene)
+    server.initial_camera.look_at = centre
     first = scene.poses(np.zeros(1))[0]
     return add.add_camera_frustum(
-        "/camera", fov, aspect, scale=2 * frustum, thickness=thickness, color=_CAMERA, format="png",
-        image=None if scene.render is None else scene.render(0.0), **_placed(first),
+        "/camera", fov, aspect, scale=2.5 * frustum, thickness=thickness, color=_CAMERA, format="png",
+        image=picture, **_placed(first),
     )  # fmt: skip
 
 
-def _overview(up, centre, size) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """Where to look from and at: from aslant above, far enough to see all."""
-    side = np.cross(up, np.eye(3)[np.abs(up).argmin()])
-    side = side / np.linalg.norm(side)
-    return centre + size * (0.55 * side + 0.65 * np.asarray(up)), centre
+def _overview(scene: Scene) -> Float[np.ndarray, "3"]:
+    """Where to look from, seen from the middle of all: from above, and from behind the cameras."""
+    up, behind = scene.up, -scene.poses(scene.t)[:, :3, 2].mean(axis=0)
+    behind -= (behind @ up) * up
+    if np.linalg.norm(behind) < 0.3:  # they look to all sides
+        behind = np.cross(up, np.eye(3)[np.abs(up).argmin()])
+    return 0.45 * behind / np.linalg.norm(behind) + 0.5 * up
 
 
 def _move(camera: Any, scene: Scene, t: float) -> None:
@@ -135,62 +134,63 @@ def _line(add: Any, name: str, points: Float[np.ndarray, "n 3"], colour, thickne
     add.add_line_segments(name, pieces, colour, thickness=thickness)
 
 
-def _surface(add: Any, file: Path) -> Float[np.ndarray, "2 3"]:
-    """The map; returns the corners of most of it."""
+def _surface(add: Any, file: Path) -> Float[np.ndarray, "n 3"]:
+    """The map; returns its points."""
     try:
         shape: Any = trimesh.load(file, process=False)
+        points = np.asarray(shape.vertices, np.float32)
+        if isinstance(shape, trimesh.PointCloud):
+            spacing = float(np.linalg.norm(np.ptp(points, axis=0))) / 400
+            add.add_point_cloud("/map", points, np.asarray(shape.colors)[:, :3], point_size=spacing)
+        elif len(points):
+            add.add_mesh_trimesh("/map", shape)
     except Exception as error:  # trimesh raises many kinds on damaged files
         raise DataError(f"{file}: expected a PLY, got {' '.join(str(error).split())}") from None
-    points = np.asarray(shape.vertices, np.float32)
-    if isinstance(shape, trimesh.Trimesh):
-        add.add_mesh_trimesh("/map", shape)
-    else:
-        spacing = float(np.linalg.norm(np.ptp(points, axis=0))) / 400
-        add.add_point_cloud("/map", points, np.asarray(shape.colors)[:, :3], point_size=spacing)
-    return np.percentile(points, [2, 98], axis=0)
+    return points
 
 
-def _panel(server: viser.ViserServer, scene: Scene, camera: Any) -> Callable[[], None]:
+def _panel(
+    server: viser.ViserServer, scene: Scene, camera: Any, picture: Picture | None
+) -> Callable[[], None]:
     """The panel: time, the picture at it, what is shown; returns what ends its work."""
     gui, last = server.gui, float(scene.t[-1])
     gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
     gui.set_panel_label("jaxpose")
     step = 10.0 ** np.floor(np.log10(last / 200)) if last else 1.0
-    time = gui.add_slider("time [s]", 0.0, float(np.ceil(last / step) * step), float(step), 0.0)
+    time = gui.add_slider("time [s]", 0.0, float(max(1, np.ceil(last / step)) * step), float(step), 0.0)
     shows = None
-    if scene.render is not None:
-        shows = gui.add_image(scene.render(0.0), label="render at this time", format="png")
+    if picture is not None:
+        shows = gui.add_image(picture, label="render at this time", format="png")
 
     def render(t: float) -> None:
         assert scene.render is not None and shows is not None
-        picture = scene.render(min(t, last))
-        shows.image = camera.image = picture
+        shows.image = camera.image = scene.render(min(t, last), WIDTH)
 
     ask, stop = _latest(render)
 
     @time.on_update
-    def _(event) -> None:
+    async def _(event) -> None:  # on the server's own thread, so one after the other
         with server.atomic():
             _move(camera, scene, min(time.value, last))
         if scene.render is not None:
             ask(time.value)
 
-    for name, label, colour in (
-        ("/estimate", "estimate", _ESTIMATE),
-        ("/truth", "truth", _TRUTH),
-        ("/keyframes", "keyframes", _KEYFRAME),
-        ("/frames", "frames", _ESTIMATE),
-        ("/camera", "camera at this time", _CAMERA),
-        ("/map", "map", None),
+    for name, label in (
+        ("/estimate", "estimate (blue)"),
+        ("/truth", "truth (red)"),
+        ("/keyframes", "keyframes (orange)"),
+        ("/frames", "frames"),
+        ("/camera", "camera (green)"),
+        ("/map", "map"),
     ):
         node = server.scene.get_handle_by_name(name)
         if node is not None:
-            _switch(gui, node, label, colour)
+            _switch(gui, node, label)
     gui.add_markdown("\n\n".join((scene.name, *scene.notes)))
     return stop
 
 
-def _switch(gui: Any, node: Any, label: str, colour: tuple[int, int, int] | None) -> None:
+def _switch(gui: Any, node: Any, label: str) -> None:
     box = gui.add_checkbox(label, True)
 
     @box.on_update

@@ -14,12 +14,14 @@ from jaxpose.errors import DataError
 if TYPE_CHECKING:
     from jaxpose.camera import Camera
 
-WIDTH = 160  # [px] of pictures, about
+WIDTH = 160  # [px] of pictures
+_RENDERED_WIDTH = 80  # [px] of those that stand in for missing images
 _PATH_STEPS = 4000  # pieces of the drawn path at most
 _UPRIGHT = 0.9  # cosine: cameras that stand so upright on an axis of the world say that it points up
 
 Picture = UInt8[np.ndarray, "h w 3"]
 Poses = Callable[[Float[np.ndarray, " n"]], Float[np.ndarray, "n 4 4"]]
+Render = Callable[[float, int], Picture]  # at a time [s], about so wide [px]
 
 
 class Shot(NamedTuple):
@@ -43,7 +45,7 @@ class Scene(NamedTuple):
     surface: Path | None  # PLY: a mesh, or else points
     up: Float[np.ndarray, "3"]
     poses: Poses  # T_world_cam at any times
-    render: Callable[[float], Picture] | None  # what the run's scene shows from there
+    render: Render | None  # what the run's scene shows from there
     notes: tuple[str, ...]
 
 
@@ -146,9 +148,7 @@ def _keyframes(source: Source) -> Float[np.ndarray, "j 3"]:
     return source.trajectory.T[rows, :3, 3]
 
 
-def _render(
-    source: Source, poses: Poses, camera: "Camera"
-) -> tuple[Callable[[float], Picture] | None, tuple[str, ...]]:
+def _render(source: Source, poses: Poses, camera: "Camera") -> tuple[Render | None, tuple[str, ...]]:
     """What the run's scene shows at a time, compiled when first asked for; notes where it keeps none."""
     from jaxpose.commands import view_render
 
@@ -159,14 +159,14 @@ def _render(
         return view_render.of_map(folder / "map.npz", camera, poses), ()
     if (folder / "settings.json").is_file() and (folder / "checkpoint.npz").is_file():
         try:
-            return view_render.of_radiance(folder, source.trajectory.t[0], WIDTH), ()
+            return view_render.of_radiance(folder, source.trajectory.t[0]), ()
         except (DataError, OSError, KeyError, TypeError, ValueError) as error:
             return None, (f"no renders: {' '.join(str(error).split())}",)
     return None, ("no renders: the run keeps neither map.npz nor checkpoint.npz",)
 
 
 def _shots(
-    source: Source, most: int, images: tuple[Path, ...], render: Callable[[float], Picture] | None
+    source: Source, most: int, images: tuple[Path, ...], render: Render | None
 ) -> tuple[tuple[Shot, ...], tuple[str, ...]]:
     """Some of the frames, evenly, the first and the last among them."""
     t, T = source.trajectory
@@ -174,7 +174,7 @@ def _shots(
     shots = []
     for row in rows:
         s = float(t[row] - t[0])
-        picture = _small(images[row]) if images else None if render is None else render(s)
+        picture = _small(images[row]) if images else None if render is None else render(s, _RENDERED_WIDTH)
         shots.append(Shot(s, T[row], picture))
     rendered = not images and render is not None and most
     return tuple(shots), ("the images are on no disk: frustums show renders",) if rendered else ()

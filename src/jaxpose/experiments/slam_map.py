@@ -47,15 +47,11 @@ class Rendered(NamedTuple):
 Renderer = Callable[[int], Rendered]
 
 
-class Viewer(NamedTuple):
-    """Pictures of a map from any pose."""
-
-    # From parameters and T_world_cam: colour in [0, 1] and depth [m] (0: nothing there) of the pixels.
-    look: Callable[
-        [Any, Float[np.ndarray, "4 4"]], tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]
-    ]
-    row: Int[np.ndarray, "h w"]  # of the camera's own image, for each rendered pixel
-    column: Int[np.ndarray, "h w"]
+# From parameters, T_world_cam and pixels (u, v): colour in [0, 1] and depth [m] (0: nothing there).
+Viewer = Callable[
+    [Any, Float[np.ndarray, "4 4"], Int[np.ndarray, "h w 2"]],
+    tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]],
+]
 
 
 class SavedMap(NamedTuple):
@@ -102,11 +98,13 @@ def _quality(render: Renderer, chosen: Bool[np.ndarray, " n"]) -> dict[str, Any]
 
 def renderer(recording: Recording, result: SlamResult) -> Renderer:
     """The frame with a given index, and the map as seen from its estimated pose."""
-    look, row, column = viewer(result.scene, result.grid, recording.camera)
+    look = viewer(result.scene, result.grid, recording.camera)
+    pixels = every(recording.camera, _VIEW_WIDTH)
+    column, row = np.moveaxis(pixels, -1, 0)
 
     def at(i: int) -> Rendered:
         frame = recording.read(i)
-        rgb, depth = look(result.scene_params, result.T_world_cam[i])
+        rgb, depth = look(result.scene_params, result.T_world_cam[i], pixels)
         photograph = np.asarray(frame.rgb)
         return Rendered(
             photograph, photograph[row, column] / 255, np.asarray(frame.depth)[row, column], rgb, depth
@@ -116,12 +114,10 @@ def renderer(recording: Recording, result: SlamResult) -> Renderer:
 
 
 def viewer(scene: SceneField, grid: GridConfig, camera: Camera) -> Viewer:
-    """The map of a grid as seen from any pose of the camera; only every few of its pixels are rendered.
+    """The map of a grid as seen from any pose of the camera; compiled once, whatever the pixels.
 
     A first pass over evenly spaced samples finds the surface, a second one looks closely.
     """
-    step = max(1, round(camera.width / _VIEW_WIDTH))
-    row, column = np.mgrid[step // 2 : camera.height : step, step // 2 : camera.width : step]
     fine = SampleConfig(band=grid.truncation, width=grid.truncation / 8)
     reach = float(np.linalg.norm(np.subtract(grid.upper, grid.lower)))
     evenly = int(np.clip(reach / grid.truncation * 4, 64, 256))
@@ -138,17 +134,22 @@ def viewer(scene: SceneField, grid: GridConfig, camera: Camera) -> Viewer:
         there = (surface > 0) & (seen.opacity > 0.5)
         return jnp.where(there[:, None], seen.rgb, 0.86), jnp.where(there, seen.depth, 0)
 
-    count = row.size
-    padded = np.arange(-(-count // _CHUNK) * _CHUNK) % count  # whole chunks: one shape is compiled
-    pixel = np.stack([column, row], axis=-1).reshape(-1, 2)[padded].reshape(-1, _CHUNK, 2)
-
-    def look(params: Any, T_world_cam: Float[np.ndarray, "4 4"]):
-        pose = jnp.asarray(T_world_cam, jnp.float32)
-        parts = [jax.device_get(render(params, pose, jnp.asarray(chunk, jnp.float32))) for chunk in pixel]
+    def look(params, T_world_cam, pixels):
+        pose, count = jnp.asarray(T_world_cam, jnp.float32), pixels[..., 0].size
+        padded = np.arange(-(-count // _CHUNK) * _CHUNK) % count  # whole chunks: one shape is compiled
+        chunks = pixels.reshape(-1, 2)[padded].reshape(-1, _CHUNK, 2)
+        parts = [jax.device_get(render(params, pose, jnp.asarray(chunk, jnp.float32))) for chunk in chunks]
         rgb, depth = (np.concatenate(x)[:count] for x in zip(*parts, strict=True))
-        return rgb.reshape(*row.shape, 3), depth.reshape(row.shape)
+        return rgb.reshape(*pixels.shape[:2], 3), depth.reshape(pixels.shape[:2])
 
-    return Viewer(look, row, column)
+    return look
+
+
+def every(camera: Camera, width: int) -> Int[np.ndarray, "h w 2"]:
+    """Every few pixels (u, v) of an image, to make a picture of about this width."""
+    step = max(1, round(camera.width / width))
+    row, column = np.mgrid[step // 2 : camera.height : step, step // 2 : camera.width : step]
+    return np.stack([column, row], axis=-1)
 
 
 def write_map(path: Path | str, result: SlamResult) -> None:
