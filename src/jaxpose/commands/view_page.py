@@ -47,11 +47,12 @@ def save(scene: Scene, file: Path) -> None:
         recording = server.get_scene_serializer()
         last = float(scene.t[-1])
         count = min(_SAVED_FRAMES, max(2, round(30 * last)))
-        for t in np.linspace(0, last, count):
+        for k, t in enumerate(np.linspace(0, last, count)):
+            if k:
+                recording.insert_sleep(last / (count - 1))
             _move(camera, scene, float(t))
             if scene.render is not None:
                 camera.image = scene.render(float(t), WIDTH)
-            recording.insert_sleep(last / (count - 1))
         page = recording.as_html()
     finally:
         _stop(server)
@@ -100,7 +101,7 @@ def _draw(server: viser.ViserServer, scene: Scene, picture: Picture | None) -> A
             f"/frames/{number:04d}", fov, aspect, scale=frustum, thickness=0.5 * thickness, color=_ESTIMATE,
             image=shot.rgb, **_placed(shot.T_world_cam),
         )  # fmt: skip
-    server.initial_camera.position = centre + size_of_all * _overview(scene)
+    server.initial_camera.position = centre + size_of_all * overview(scene)
     server.initial_camera.look_at = centre
     first = scene.poses(np.zeros(1))[0]
     return add.add_camera_frustum(
@@ -109,7 +110,7 @@ def _draw(server: viser.ViserServer, scene: Scene, picture: Picture | None) -> A
     )  # fmt: skip
 
 
-def _overview(scene: Scene) -> Float[np.ndarray, "3"]:
+def overview(scene: Scene) -> Float[np.ndarray, "3"]:
     """Where to look from, seen from the middle of all: from above, and from behind the cameras."""
     up, behind = scene.up, -scene.poses(scene.t)[:, :3, 2].mean(axis=0)
     behind -= (behind @ up) * up
@@ -166,7 +167,7 @@ def _panel(
         assert scene.render is not None and shows is not None
         shows.image = camera.image = scene.render(min(t, last), WIDTH)
 
-    ask, stop = _latest(render)
+    ask, stop = latest(render)
 
     @time.on_update
     async def _(event) -> None:  # on the server's own thread, so one after the other
@@ -198,7 +199,7 @@ def _switch(gui: Any, node: Any, label: str) -> None:
         node.visible = box.value
 
 
-def _latest(work: Callable[[float], None]) -> tuple[Callable[[float], None], Callable[[], None]]:
+def latest(work: Callable[[float], None]) -> tuple[Callable[[float], None], Callable[[], None]]:
     """Ask for a value to be worked on, one at a time and the last one first: those it overtakes are dropped.
 
     The second function ends the work.

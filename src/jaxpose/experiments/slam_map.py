@@ -152,18 +152,11 @@ def every(camera: Camera, width: int) -> Int[np.ndarray, "h w 2"]:
     return np.stack([column, row], axis=-1)
 
 
-def write_map(path: Path | str, result: SlamResult) -> None:
-    """Write the map (npz, compressed): the grid's box, its merged values, and which frames are keyframes."""
-    (values,) = result.scene_params
+def write_map(path: Path | str, saved: SavedMap) -> None:
+    """Write a map (npz, compressed): version, the fields of its `GridConfig`, values and keyframes."""
+    arrays = asdict(saved.grid) | {"values": saved.values, "keyframes": saved.keyframes}
     with io.atomic(path) as temporary:
-        np.savez_compressed(
-            temporary,
-            allow_pickle=False,
-            version=_VERSION,
-            **asdict(result.grid),
-            values=np.asarray(values),
-            keyframes=np.array([keyframe.index for keyframe in result.keyframes]),
-        )
+        np.savez_compressed(temporary, allow_pickle=False, version=_VERSION, **arrays)
 
 
 def read_map(path: Path | str) -> SavedMap:
