@@ -1,8 +1,12 @@
 """`jaxpose view`: what a scene holds, what a saved page plays, wrong calls; the page in a browser (slow)."""
 
 import base64
+import io as std_io
 import re
+import shutil
+import signal
 import socket
+import subprocess
 import sys
 import threading
 import time
@@ -274,6 +278,7 @@ BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 # WebGL without a graphics card, and a sandbox that root may not have.
 FLAGS = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 SIZE = (1280, 800)
+PICTURE = "img[src^='blob:'], img[src^='data:image/png']"
 
 
 @pytest.fixture(scope="module")
@@ -320,7 +325,7 @@ def shown_picture(page):
         const bytes = new Uint8Array(await (await fetch(image.src)).arrayBuffer());
         return Array.from(bytes);
     }"""
-    return pixels(bytes(page.locator("img").first.evaluate(read)))
+    return pixels(bytes(page.locator(PICTURE).evaluate(read)))
 
 
 def until(condition, seconds=60):
@@ -362,11 +367,14 @@ def test_the_slider_moves_the_camera_and_shows_the_render_of_its_time(browser, a
     page.on("request", lambda request: asked.append(request.url))
     page.goto(address)
     page.wait_for_selector("canvas")
-    until(lambda: page.locator("img").count() > 0)
+    page.wait_for_selector(PICTURE)
     np.testing.assert_array_equal(shown_picture(page), scene.render(0.0, WIDTH))
-    for box in page.get_by_role("checkbox").all():  # only the camera stays, so that green is its frustum
-        if "camera" not in box.evaluate("box => box.closest('div[class*=Flex]')?.innerText ?? ''"):
-            box.uncheck(force=True)
+    switches = page.get_by_role("checkbox").first.bounding_box()
+    for label in ("estimate (blue)", "frames", "map"):  # what may hide the camera or be as green
+        text = page.get_by_text(label, exact=True)
+        if text.count():
+            box = text.bounding_box()
+            page.mouse.click(switches["x"] + switches["width"] / 2, box["y"] + box["height"] / 2)
     time.sleep(5)
     before = pixels(page.screenshot())
     value = round(0.7 * last, 2)
@@ -381,6 +389,7 @@ def test_the_slider_moves_the_camera_and_shows_the_render_of_its_time(browser, a
     panel = 945  # [px] where it begins
     moved = green(after[:, :panel]) - green(before[:, :panel])
     print(moved, on_screen(scene, scene.poses(np.array([0, value]))[:, :3, 3]))
-    Image.fromarray(before).save("/tmp/shots/t_before.png"); Image.fromarray(after).save("/tmp/shots/t_after.png")
+    Image.fromarray(before).save("/tmp/shots/t_before.png")
+    Image.fromarray(after).save("/tmp/shots/t_after.png")
     here = ("data:", "blob:", address)
     assert [url for url in asked if not url.startswith(here)] == []  # nothing from the network
