@@ -277,7 +277,7 @@ def test_help(capsys):
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 # WebGL without a graphics card, and a sandbox that root may not have.
 FLAGS = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
-SIZE = (1280, 800)
+SIZE, PANEL = (1280, 800), 940  # [px] the page, and where its panel begins
 PICTURE = "img[src^='blob:'], img[src^='data:image/png']"
 
 
@@ -335,12 +335,12 @@ def until(condition, seconds=60):
         time.sleep(0.2)
 
 
-def green(screenshot):
-    """Row and column of the middle of the camera's frustum, by its colour."""
-    r, g, b = np.moveaxis(screenshot.astype(int), -1, 0)
-    rows, columns = np.nonzero((g > r + 60) & (g > b + 60))
-    assert len(rows) > 100
-    return np.array([rows.mean(), columns.mean()])
+def to_green(screenshot, place):
+    """Distance [px] from a row and column to the nearest pixel of the camera's frustum, by its colour."""
+    r, g, b = np.moveaxis(screenshot[:, :PANEL].astype(int), -1, 0)
+    found = np.argwhere((g > r + 60) & (g > b + 60))
+    assert len(found) > 100
+    return np.linalg.norm(found - place, axis=1).min()
 
 
 def on_screen(scene, points):
@@ -354,7 +354,7 @@ def on_screen(scene, points):
     right = right / np.linalg.norm(right)
     away = points - eye
     scale = SIZE[1] / 2 / np.tan(np.radians(75) / 2) / (away @ forward)
-    row = SIZE[1] / 2 + scale * (away @ np.cross(right, forward)) * -1
+    row = SIZE[1] / 2 - scale * (away @ np.cross(right, forward))
     return np.stack([row, SIZE[0] / 2 + scale * (away @ right)], axis=-1)
 
 
@@ -386,10 +386,10 @@ def test_the_slider_moves_the_camera_and_shows_the_render_of_its_time(browser, a
     until(lambda: np.array_equal(shown_picture(page), expected))
     time.sleep(5)
     after = pixels(page.screenshot())
-    panel = 945  # [px] where it begins
-    moved = green(after[:, :panel]) - green(before[:, :panel])
-    print(moved, on_screen(scene, scene.poses(np.array([0, value]))[:, :3, 3]))
-    Image.fromarray(before).save("/tmp/shots/t_before.png")
-    Image.fromarray(after).save("/tmp/shots/t_after.png")
+    # Where the tip of its frustum has to be, before and after: there it is, and not at the other time.
+    first, then = on_screen(scene, scene.poses(np.array([0, value]))[:, :3, 3])
+    assert np.linalg.norm(first - then) > 20
+    assert to_green(before, first) < 4 and to_green(after, then) < 4
+    assert to_green(before, then) > 8 and to_green(after, first) > 8
     here = ("data:", "blob:", address)
     assert [url for url in asked if not url.startswith(here)] == []  # nothing from the network
