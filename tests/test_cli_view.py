@@ -142,6 +142,17 @@ def test_a_truth_in_a_world_of_its_own(run):
     assert np.abs(scene.reference - poses_at(t)[:, :3, 3]).max() < 0.2
 
 
+def test_the_overview_has_the_path_before_it(run):
+    scene = read_scene(run, 0)
+    wall = np.random.default_rng(0).uniform([-1, -1, WALL], [1, 1, WALL], (500, 3))
+    eye, centre, size = view_page.overview(scene, wall)
+    assert eye[2] < 0 and eye[1] < centre[1]  # behind the cameras, which look along z, and above: up is -y
+    forward = (centre - eye) / np.linalg.norm(centre - eye)
+    away = np.concatenate([scene.path, wall]) - eye
+    angle = np.arccos(away @ forward / np.linalg.norm(away, axis=1))
+    assert np.degrees(angle).max() < 75 / 2  # half of viser's field of view
+
+
 def test_up_is_where_upright_cameras_say():
     down = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # x right, image down is -z: z is up
     T = np.tile(np.eye(4), (2, 1, 1))
@@ -345,10 +356,9 @@ def to_green(screenshot, place):
 
 def on_screen(scene, points):
     """Row and column of points, from where the page is looked at first (field of view 75 degrees)."""
-    surface = trimesh.load(scene.surface, process=False).vertices if scene.surface else scene.path
-    low, high = np.percentile(surface, [2, 98] if scene.surface else [0, 100], axis=0)
-    eye = (low + high) / 2 + np.linalg.norm(high - low) * view_page.overview(scene)
-    forward = (low + high) / 2 - eye
+    surface = trimesh.load(scene.surface, process=False).vertices if scene.surface else scene.path[:0]
+    eye, centre, _ = view_page.overview(scene, np.asarray(surface))
+    forward = centre - eye
     forward = forward / np.linalg.norm(forward)
     right = np.cross(forward, scene.up)
     right = right / np.linalg.norm(right)

@@ -76,8 +76,8 @@ def _draw(server: viser.ViserServer, scene: Scene, picture: Picture | None) -> A
     path, add = scene.path, server.scene
     add.set_up_direction(tuple(scene.up))
     surface = path[:0] if scene.surface is None else _surface(add, scene.surface)
-    low, high = np.percentile(surface, [2, 98], axis=0) if len(surface) else (path.min(0), path.max(0))
-    centre, size_of_all = (low + high) / 2, float(np.linalg.norm(high - low)) or 1.0
+    eye, centre, size_of_all = overview(scene, surface)
+    server.initial_camera.position, server.initial_camera.look_at = eye, centre
     size = float(np.linalg.norm(np.ptp(path, axis=0)))
     frustum = max(0.035 * size, 0.012 * size_of_all)
     thickness = 0.0015 * size_of_all
@@ -101,8 +101,6 @@ def _draw(server: viser.ViserServer, scene: Scene, picture: Picture | None) -> A
             f"/frames/{number:04d}", fov, aspect, scale=frustum, thickness=0.5 * thickness, color=_ESTIMATE,
             image=shot.rgb, **_placed(shot.T_world_cam),
         )  # fmt: skip
-    server.initial_camera.position = centre + size_of_all * overview(scene)
-    server.initial_camera.look_at = centre
     first = scene.poses(np.zeros(1))[0]
     return add.add_camera_frustum(
         "/camera", fov, aspect, scale=2.5 * frustum, thickness=thickness, color=_CAMERA, format="png",
@@ -110,13 +108,23 @@ def _draw(server: viser.ViserServer, scene: Scene, picture: Picture | None) -> A
     )  # fmt: skip
 
 
-def overview(scene: Scene) -> Float[np.ndarray, "3"]:
-    """Where to look from, seen from the middle of all: from above, and from behind the cameras."""
+def overview(
+    scene: Scene, surface: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"], float]:
+    """Where to look from, the middle of the path and most of the surface, and their diagonal.
+
+    The look is from above, and from behind the cameras if these look to one side.
+    """
+    corners = [scene.path.min(axis=0), scene.path.max(axis=0)]
+    if len(surface):
+        corners += [*np.percentile(surface, [2, 98], axis=0)]
+    low, high = np.min(corners, axis=0), np.max(corners, axis=0)
+    centre, size = (low + high) / 2, float(np.linalg.norm(high - low)) or 1.0
     up, behind = scene.up, -scene.poses(scene.t)[:, :3, 2].mean(axis=0)
     behind -= (behind @ up) * up
-    if np.linalg.norm(behind) < 0.3:  # they look to all sides
+    if np.linalg.norm(behind) < 0.3:
         behind = np.cross(up, np.eye(3)[np.abs(up).argmin()])
-    return 0.45 * behind / np.linalg.norm(behind) + 0.5 * up
+    return centre + size * (0.45 * behind / np.linalg.norm(behind) + 0.5 * up), centre, size
 
 
 def _move(camera: Any, scene: Scene, t: float) -> None:
