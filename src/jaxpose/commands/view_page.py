@@ -124,7 +124,7 @@ def overview(
     behind -= (behind @ up) * up
     if np.linalg.norm(behind) < 0.3:
         behind = np.cross(up, np.eye(3)[np.abs(up).argmin()])
-    return centre + size * (0.45 * behind / np.linalg.norm(behind) + 0.5 * up), centre, size
+    return centre + size * (0.52 * behind / np.linalg.norm(behind) + 0.6 * up), centre, size
 
 
 def _move(camera: Any, scene: Scene, t: float) -> None:
