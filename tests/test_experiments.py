@@ -27,7 +27,7 @@ FRAMES = 8
 PICTURES = {"trajectory.png", "errors.png", "renders.png"}
 FILES = PICTURES | {
     "config.json", "results.json", "trajectory.txt", "reference.txt", "field.npz", "camera.json",
-    "mesh.ply", "points.ply",
+    "map.npz", "mesh.ply", "points.ply",
 }  # fmt: skip
 
 

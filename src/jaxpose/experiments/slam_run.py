@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from jaxpose import io, plots
 from jaxpose.errors import DataError
-from jaxpose.experiments.slam_map import Renderer, map_quality, renderer, views
+from jaxpose.experiments.slam_map import Renderer, SavedMap, map_quality, renderer, views, write_map
 from jaxpose.experiments.slam_measure import Accuracy, Inertial, accuracy, cost, inertial
 from jaxpose.experiments.slam_options import Options, Source, load, slam_config
 from jaxpose.experiments.slam_report import table
@@ -127,6 +127,8 @@ def _single(
         io.write_tum(folder / "reference.txt", io.Trajectory(recording.t, truth))
     span = (0.0, float(recording.t[-1] - recording.t[0]))
     write_field(folder / "field.npz", span, [bspline_factor(span, result.field_params)])
+    keyframes = np.array([keyframe.index for keyframe in result.keyframes])
+    write_map(folder / "map.npz", SavedMap(result.grid, np.asarray(result.scene_params[0]), keyframes))
     images_folder = "." if options.data is None else options.data.resolve()
     notes = (*recording.notes, *_write_surface(folder, recording, result))
     write_camera(folder / "camera.json", recording.camera, recording.files, images_folder)
