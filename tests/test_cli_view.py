@@ -304,7 +304,7 @@ def browser():
         browser.close()
 
 
-@pytest.fixture(scope="module", params=["rgbd_slam", "noisy_nerf"])
+@pytest.fixture(scope="module", params=["rgbd_slam", "noisy_nerf", "event_nerf"])
 def smoke_run(request, tmp_path_factory):
     """A run of seconds, by the command itself."""
     out = tmp_path_factory.mktemp("runs") / request.param

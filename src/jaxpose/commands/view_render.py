@@ -1,5 +1,6 @@
 """What the scene of a run shows at a time: the map of a SLAM run, the radiance field of a NeRF."""
 
+import json
 from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
@@ -12,8 +13,9 @@ from jaxtyping import Float
 from jaxpose import nerf, scenes
 from jaxpose.camera import Camera, scale
 from jaxpose.commands.view_scene import Picture, Poses, Render
-from jaxpose.experiments import slam_map
-from jaxpose.experiments.noisy_nerf import load_run
+from jaxpose.errors import DataError
+from jaxpose.experiments import event_nerf, noisy_nerf, slam_map
+from jaxpose.nerf import TrainConfig
 
 
 def of_map(file: Path, camera: Camera, poses: Poses) -> Render:
@@ -29,15 +31,23 @@ def of_map(file: Path, camera: Camera, poses: Poses) -> Render:
 
 
 def of_radiance(folder: Path, first: float) -> Render:
-    """The radiance field of a `noisy_nerf` run from where its pose field is `t` after `first` [s]."""
-    problem, setup, state = load_run(folder)
-    camera = problem.train.camera
+    """The radiance field of a NeRF run from where its pose field is `t` after `first` [s]."""
+    experiment = json.loads((folder / "results.json").read_text()).get("experiment")
+    if experiment == "event_nerf":
+        problem, setup, state = event_nerf.load_run(folder)
+        camera, depths, background = problem.recording.camera, problem.depths, problem.background
+    elif experiment == "noisy_nerf":
+        problem, setup, state = noisy_nerf.load_run(folder)
+        camera, depths, background = problem.train.camera, setup.depths, None
+    else:
+        raise DataError(f"{folder}: expected a run of noisy_nerf or event_nerf, got {experiment}")
+    config = TrainConfig(steps=1, rays=1, samples=setup.train.samples, chunk=64)
     pose = jax.jit(partial(setup.field.pose, state.pose))
 
     @cache
     def image(width: int) -> Callable:
         small = scale(camera, min(1.0, width / camera.width))
-        return nerf.viewer(setup.scene, small, setup.depths, setup.train).image
+        return nerf.viewer(setup.scene, small, depths, config, background=background).image
 
     def render(t: float, width: int) -> Picture:
         return _picture(image(width)(state.scene, pose(jnp.float32(first + t)))[0])

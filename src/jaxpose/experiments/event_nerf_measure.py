@@ -117,7 +117,7 @@ def measure(problem: Problem, setup: Setup, state: State, truth: Truth | None) -
 
 
 def constant_rotation_deg(estimate: Float[np.ndarray, "m 4 4"], truth: Float[np.ndarray, "m 4 4"]) -> float:
-    """Angle of the mean turn from true to estimated orientations, in camera axes: what a wrong axis leaves."""
+    """Angle of the mean turn from true to estimated orientations, in camera axes: a wrong axis leaves it."""
     turns = np.swapaxes(truth[:, :3, :3], 1, 2) @ estimate[:, :3, :3]
     return float(np.degrees(Rotation.from_matrix(turns).mean().magnitude()))
 
