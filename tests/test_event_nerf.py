@@ -126,6 +126,16 @@ def test_a_trajectory_that_is_not_refined_stays(tmp_path):
     assert results["training"]["loss"] == "window" and results["training"]["net"] is None
 
 
+def test_studies_vary_one_thing_for_both_trajectories():
+    runs = event_nerf._study(Config(seed=3), "known")
+    assert list(runs) == [f"known{n}-{pose}" for n in (20, 10, 6) for pose in ("linear", "posenet")]
+    assert (runs["known6-linear"].known, runs["known6-linear"].pose) == (6, "linear")
+    assert {config.seed for config in runs.values()} == {3}
+    offsets = [config.axis_offset_deg for config in event_nerf._study(Config(), "offset").values()]
+    assert offsets == [1, 1, 2, 2, 2.85, 2.85]
+
+
+@pytest.mark.slow
 def test_a_study_puts_runs_side_by_side(tmp_path, monkeypatch):
     monkeypatch.setattr(event_nerf, "_KNOWN", (10,))
     outcome = event_nerf.run(smoke(study="known", out=tmp_path / "both"))
@@ -166,15 +176,21 @@ def test_the_correction_undoes_a_slope_and_an_offset_of_log_intensity():
 
 
 @pytest.mark.data
-def test_real_events_run_with_known_and_unknown_poses(data_dir, tmp_path):
-    data = data_dir / "ecd_slider_depth"
-    known = event_nerf.run(smoke(data=data, out=tmp_path / "known")).results
-    assert known["frames"]["psnr"] > 0 and known["psnr"] is None
-    unknown = event_nerf.run(smoke(data=data, poses="unknown", out=tmp_path / "unknown"))
-    slide = unknown.results["slide"]
+def test_real_events_with_known_poses(data_dir, tmp_path):
+    results = event_nerf.run(smoke(data=data_dir / "ecd_slider_depth", out=tmp_path / "run")).results
+    assert results["frames"]["psnr"] > 0 and results["psnr"] is None
+    assert results["data"]["events"] == 50_000
+
+
+@pytest.mark.data
+@pytest.mark.slow
+def test_real_events_with_unknown_poses(data_dir, tmp_path):
+    config = smoke(data=data_dir / "ecd_slider_depth", poses="unknown", out=tmp_path / "run")
+    outcome = event_nerf.run(config)
+    slide = outcome.results["slide"]
     assert slide["start_direction_error_deg"] < 5
     assert slide["contrast"]["1"] > max(slide["contrast"]["0"], slide["contrast"]["-1"])
-    assert (unknown.folder / "frames.png").exists() and "n/a" in report(*unknown)
+    assert (outcome.folder / "frames.png").exists() and "n/a" in report(*outcome)
 
 
 # --- what is not possible --------------------------------------------------------------------------------
