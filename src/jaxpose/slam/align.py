@@ -111,8 +111,9 @@ def align(
 ) -> Alignment:
     """The pose near a start that brings measured points onto the map's surface, by Gauss-Newton steps.
 
-    Distances count by their squares, colours by their size. The predicted pose is a measurement too, with
-    `sigma` [m, rad]; against it the image counts as `_INDEPENDENT` pixels, since errors of a map go together.
+    Residuals count by their size, within one sigma by their square: by squares throughout, what a camera
+    newly sees behind thin things drew it away. The predicted pose is a measurement too, with `sigma`
+    [m, rad]; against it the image counts as `_INDEPENDENT` pixels, since errors of a map go together.
     """
     prior = jnp.repeat(sigma, 3) ** -2
 
@@ -120,8 +121,9 @@ def align(
         found, by = surface_residuals(look_up, T, pixels, config)
         residual = jnp.concatenate([found.depth, found.colour.reshape(-1)])
         slope = jnp.concatenate([by.depth, by.colour.reshape(-1, 6)])
+        w_depth = found.inlier / jnp.maximum(jnp.abs(found.depth), 1)
         w_colour = config.colour_weight / 3 * found.inlier[:, None] / jnp.maximum(jnp.abs(found.colour), 1)
-        weighted = jnp.concatenate([found.inlier, w_colour.reshape(-1)])[:, None] * slope
+        weighted = jnp.concatenate([w_depth, w_colour.reshape(-1)])[:, None] * slope
         away = se3.log(se3.compose(se3.inverse(T_world_predicted), T))
         share = jnp.sum(found.inlier) / _INDEPENDENT
         information = jnp.matmul(weighted.T, slope, precision="highest") + share * jnp.diag(prior)
