@@ -20,7 +20,7 @@ from jaxpose.recording import Frame, Recording
 from jaxpose.scenes import GridConfig, SceneField, box, grid, grow, merge
 from jaxpose.slam.frames import FrameName, gauge, make_field
 from jaxpose.slam.keyframes import Keyframe, choose, overlap
-from jaxpose.slam.mapping import MapConfig, MapState, make_descend, make_fuse
+from jaxpose.slam.mapping import MapConfig, MapState, look_up, make_descend, make_fuse
 from jaxpose.slam.objective import ImuWeights, TrackConfig
 from jaxpose.slam.observe import Image
 from jaxpose.slam.predict import (
@@ -172,8 +172,8 @@ def run(
             interval, predicted = _interval(dt, T_world_body, t[:i], twist, velocity, readings, config.imu)
             where = gauge(config.frame, float(t[i - 1] - t[0]), T_world_body[-1], T_world_body[0], generator)
             tracked = world.track(
-                world.merged, params, jnp.asarray(T_world_body[-1], jnp.float32), where, interval, image,
-                jnp.float32(far), track_key,
+                world.merged, world.state.memory, params, jnp.asarray(T_world_body[-1], jnp.float32), where,
+                interval, image, jnp.float32(far), track_key,
             )  # fmt: skip
             tracked = jax.device_get(tracked)
             params = tracked.params
@@ -300,7 +300,9 @@ def _compile(recording, config, settle, grid_config: GridConfig, state: MapState
         init_map, update = make_descend(scene, recording.camera, map_config)
     track_config = replace(config.track, sample=replace(config.track.sample, **scale))
     T_body_cam = jnp.asarray(recording.T_body_cam, jnp.float32)
-    track = make_track(scene, recording.camera, T_body_cam, track_config, settle)
+    track = make_track(
+        scene, partial(look_up, scene, grid_config), recording.camera, T_body_cam, track_config, settle
+    )
     state = init_map(scene.init(jax.random.key(0))) if state is None else state
     return _World(grid_config, scene, state, _merge(state.params), track, update)
 
