@@ -111,8 +111,8 @@ def align(
 ) -> Alignment:
     """The pose near a start that brings measured points onto the map's surface, by Gauss-Newton steps.
 
-    Residuals count by their size, within one sigma by their square: by squares throughout, what a camera
-    newly sees behind thin things drew it away. The predicted pose is a measurement too, with `sigma`
+    Residuals count by their size, within one sigma by their square: by squares throughout, a camera between
+    furniture was lost. The predicted pose is a measurement too, with `sigma`
     [m, rad]; against it the image counts as `_INDEPENDENT` pixels, since errors of a map go together.
     """
     prior = jnp.repeat(sigma, 3) ** -2
