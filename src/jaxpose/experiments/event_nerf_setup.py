@@ -28,8 +28,9 @@ _PAPER = EventTrainConfig(steps=200_000, events=1024, samples=192, chunk=16)
 _SMOKE = EventTrainConfig(steps=CHUNK, events=32, samples=8, chunk=32)
 # Adam's first and last rate and where in the training it starts, for translation and rotation.
 _RATES = {
-    # Orientations are known: a turn that comes as fast as a shift is taken for one.
+    # Where orientations are known: a turn that came as fast as a shift would be taken for one.
     "fast": {"translation": Rate(3e-3, 1e-4, 0.03), "rotation": Rate(1e-6, 1e-7, 0.06)},
+    "turned": {"translation": Rate(1e-3, 3e-5, 0.03), "rotation": Rate(3e-5, 2e-6, 0.06)},
     "paper": {"translation": Rate(2e-4, 2e-6), "rotation": Rate(5e-5, 5e-7)},
     # A short slide is a small angle: turns of its size must come as slowly as it, after the scene.
     "unknown": {"translation": Rate(3e-4, 2e-5, 0.3), "rotation": Rate(1e-6, 1e-7, 0.3)},
@@ -107,7 +108,8 @@ def _field(
         return PoseField(lambda key: {}, lambda params, t: initial(t)), lambda params: (start,), {}
     net = replace(config.net, layers=2, width=32) if config.smoke else config.net
     posenet = PoseNetConfig(span=problem.span, translation_scale=problem.extent / 2, **asdict(net))
-    rates = _RATES["unknown" if problem.slides else config.preset]
+    wrong = "unknown" if problem.slides else "turned" if config.axis_offset_deg else "fast"
+    rates = _RATES["paper" if config.preset == "paper" else wrong]
     if config.net.coupled:
         rates = {"coupled": rates["rotation"]}
     if config.net.window is not None:
