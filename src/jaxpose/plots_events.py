@@ -67,6 +67,6 @@ def errors(
             axes.plot(t, after, color=ESTIMATE, lw=1.4, label="estimate")
             axes.set(ylabel=label, ylim=(0, None))
         panels[-1].set(xlabel="time [s]")
-        panels[0].legend(loc="upper right", ncols=2)
+        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
         figure.suptitle(title)
         _save(figure, path)

@@ -183,7 +183,7 @@ def _train(
 
 def _draw(folder: Path, config: Config, problem: Problem, measured: Measured, truth: Truth | None) -> None:
     numbers, about, recording = measured.numbers, problem.about, problem.recording
-    title = f"{about['data']}, {about['events']} events\nposes {about['poses']}"
+    title = f"{about['data']}, {about['events']} events\n{about['poses']}"
     method = f"{config.pose}, {config.loss} loss"
     camera = recording.camera
     plots_events.windows(folder / "events.png", recording.events, camera.height, camera.width, title)

@@ -169,7 +169,9 @@ def _unknown(recording: EventRecording) -> _Began:
     T_start[:, :3, 3] = (ends - ends.mean())[:, None] * slide.velocity
     depths = 1 / slide.inverse_depth
     x, y, _ = slide.velocity
-    words = f"unknown: starts as a steady slide of ({x:.3g}, {y:.3g}) typical depths a second, by contrast"
+    words = (
+        f"poses unknown: starts as a steady slide of ({x:.3g}, {y:.3g}) typical depths a second, by contrast"
+    )
     return _Began(
         Trajectory(ends, T_start),
         Depths(0.6 * float(depths.min()), 2 * float(depths.max()), "disparity"),

@@ -275,7 +275,7 @@ def _failed(tracked: Tracked, losses: list[float], config: SlamConfig) -> bool:
     """Whether tracking went wrong: too little of the image explained, or far worse than it usually is."""
     usual = float(np.median(losses[-30:])) if losses else np.inf
     explained = np.isfinite(tracked.loss) and tracked.valid >= config.track.minimum_valid
-    # A loss of one sigma is what the sensor's own noise leaves: without noise "usual" would be next to nothing.
+    # One sigma is what the sensor's own noise leaves; without noise the usual loss would be next to nothing.
     return not (explained and tracked.loss < 2 * max(usual, 1.0))
 
 
