@@ -154,13 +154,14 @@ def test_compare_runs_every_mode(finished, tmp_path, monkeypatch, recording):
         poses = io.read_tum(finished.folder / "trajectory.txt").T
         return slam_run.SlamResult(
             poses, np.zeros(FRAMES, bool), np.ones(FRAMES, bool), np.ones(FRAMES, int),
-            *np.ones((4, FRAMES)), *[None] * 3, [], field, params, 0.0, 0.0,
+            *np.ones((4, FRAMES)), None, None, (np.zeros(1),), [], field, params, 0.0, 0.0,
         )  # fmt: skip
 
     monkeypatch.setattr(slam_run, "track", quick)
     monkeypatch.setattr(slam_run, "inertial", lambda *args: None)
     monkeypatch.setattr(slam_run, "_draw", lambda *args: None)
     monkeypatch.setattr(slam_run, "_write_surface", lambda *args: ())
+    monkeypatch.setattr(slam_run, "write_map", lambda *args: None)
     monkeypatch.setattr(slam_run, "renderer", lambda *args: None)
     monkeypatch.setattr(slam_run, "map_quality", lambda *args: {"mapped": None, "held_out": None})
     outcome = imu_slam.run(imu_slam.Config(smoke=True, compare=True, out=tmp_path / "all"))
