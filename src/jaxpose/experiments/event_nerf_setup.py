@@ -17,23 +17,34 @@ from jaxpose.nerf_events import EventData, EventTrainConfig
 from jaxpose.scenes import NerfConfig, SceneField, nerf
 from jaxpose.train import Rate, Trainer
 
-_FAST_SCENE = NerfConfig(
-    layers=4, width=96, skip=2, colour_width=48, octaves=7, window=(0.2, 0.7), quiet=True
-)
-# A view of a slide is less than a unit wide, and what it shows is there from the start.
-_SLIDE_SCENE = replace(_FAST_SCENE, octaves=10, window=(0.05, 0.3))
-_SMOKE_SCENE = NerfConfig(layers=2, width=16, skip=None, colour_width=8, octaves=4, window=(0.1, 0.5))
 _FAST = EventTrainConfig(steps=3000, events=512, samples=32, chunk=32)
 _PAPER = EventTrainConfig(steps=200_000, events=1024, samples=192, chunk=16)
 _SMOKE = EventTrainConfig(steps=CHUNK, events=32, samples=8, chunk=32)
-# Adam's first and last rate and where in the training it starts, for translation and rotation.
-_RATES = {
-    # Where orientations are known: a turn that came as fast as a shift would be taken for one.
-    "fast": {"translation": Rate(3e-3, 1e-4, 0.03), "rotation": Rate(1e-6, 1e-7, 0.06)},
-    "turned": {"translation": Rate(1e-3, 3e-5, 0.03), "rotation": Rate(3e-5, 2e-6, 0.06)},
-    "paper": {"translation": Rate(2e-4, 2e-6), "rotation": Rate(5e-5, 5e-7)},
-    # A short slide is a small angle: turns of its size must come as slowly as it, after the scene.
-    "unknown": {"translation": Rate(3e-4, 2e-5, 0.3), "rotation": Rate(1e-6, 1e-7, 0.3)},
+_SMOKE_SCENE = NerfConfig(layers=2, width=16, skip=None, colour_width=8, octaves=4, window=(0.1, 0.5))
+_FAST_SCENE = NerfConfig(layers=4, width=96, skip=2, colour_width=48, octaves=7, quiet=True)
+
+
+class Plan(NamedTuple):
+    """A scene, and Adam's first and last rate and its start for the poses, by what is wrong with them."""
+
+    scene: NerfConfig
+    translation: Rate
+    rotation: Rate
+
+
+_PAPER_PLAN = Plan(NerfConfig(), Rate(2e-4, 2e-6), Rate(5e-5, 5e-7))
+_FAST_PLANS = {
+    # Orientations are known: a turn that came as fast as a shift would be taken for one. The scene stays
+    # blurred until the cameras are where it is seen.
+    "positions": Plan(
+        replace(_FAST_SCENE, window=(0.2, 0.7)), Rate(3e-3, 1e-4, 0.03), Rate(1e-6, 1e-7, 0.06)
+    ),
+    "axis": Plan(replace(_FAST_SCENE, window=(0.1, 0.5)), Rate(1e-3, 3e-5, 0.03), Rate(3e-5, 2e-6, 0.06)),
+    # A short slide is a small angle: turns of its size must come as slowly as it, after the scene. A view is
+    # less than a unit wide, and what it shows is there from the start.
+    "all": Plan(
+        replace(_FAST_SCENE, octaves=10, window=(0.05, 0.3)), Rate(3e-4, 2e-5, 0.3), Rate(1e-6, 1e-7, 0.3)
+    ),
 }
 
 
@@ -52,12 +63,11 @@ class Setup(NamedTuple):
 def build(config: Config, problem: Problem) -> Setup:
     """Scene, pose field, rates and data that the config names, for these events."""
     recording, paper = problem.recording, config.preset == "paper"
+    plan = _plan(config, problem)
     if config.smoke:
         scene, train = nerf(_SMOKE_SCENE), _SMOKE
     else:
-        scene, train = (
-            (nerf(), _PAPER) if paper else (nerf(_SLIDE_SCENE if problem.slides else _FAST_SCENE), _FAST)
-        )
+        scene, train = nerf(plan.scene), _PAPER if paper else _FAST
         train = replace(train, steps=config.steps or train.steps, events=config.events or train.events)
     span = problem.span
     # EventNeRF's windows are up to a twentieth of a turn; a slide is short as it is.
@@ -69,7 +79,7 @@ def build(config: Config, problem: Problem) -> Setup:
         longest_s=longest_s,
         background=problem.background,
     )
-    field, factors, pose_rates = _field(config, problem)
+    field, factors, pose_rates = _field(config, problem, plan)
     scene_rate = Rate(5e-4, 5e-4) if paper else Rate(1e-3, 1e-4)
     trainer = nerf_events.trainer(
         scene, field, recording.camera, problem.depths, span, scene_rate, pose_rates, train
@@ -98,8 +108,14 @@ def describe(config: Config, setup: Setup) -> dict[str, Any]:
     }
 
 
+def _plan(config: Config, problem: Problem) -> Plan:
+    if config.preset == "paper":
+        return _PAPER_PLAN
+    return _FAST_PLANS["all" if problem.slides else "axis" if config.axis_offset_deg else "positions"]
+
+
 def _field(
-    config: Config, problem: Problem
+    config: Config, problem: Problem, plan: Plan
 ) -> tuple[PoseField, Callable[[Params], tuple[Factor, ...]], dict[str, Rate]]:
     """The trajectory as a field and as factors of its file, and the rates of its parameters."""
     t, T_start = (jnp.asarray(x, jnp.float32) for x in problem.start)
@@ -108,8 +124,7 @@ def _field(
         return PoseField(lambda key: {}, lambda params, t: initial(t)), lambda params: (start,), {}
     net = replace(config.net, layers=2, width=32) if config.smoke else config.net
     posenet = PoseNetConfig(span=problem.span, translation_scale=problem.extent / 2, **asdict(net))
-    wrong = "unknown" if problem.slides else "turned" if config.axis_offset_deg else "fast"
-    rates = _RATES["paper" if config.preset == "paper" else wrong]
+    rates = {"translation": plan.translation, "rotation": plan.rotation}
     if config.net.coupled:
         rates = {"coupled": rates["rotation"]}
     if config.net.window is not None:
