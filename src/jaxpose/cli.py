@@ -1,7 +1,7 @@
 """Camera trajectories: check data, find a field that carries a motion, compare, take out and look at a run.
 
 `jaxpose COMMAND --help` tells what a command takes. The experiments that make runs are
-`python -m jaxpose.experiments.rgbd_slam`, `imu_slam`, `noisy_nerf` and `planar`.
+`python -m jaxpose.experiments.rgbd_slam`, `imu_slam`, `noisy_nerf`, `event_nerf` and `planar`.
 """
 
 import sys
