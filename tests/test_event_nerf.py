@@ -120,6 +120,7 @@ def test_resuming_a_finished_run_returns_it_and_one_of_other_settings_is_refused
     assert "expected --known None, as it began, got 6" in line
 
 
+@pytest.mark.slow
 def test_a_trajectory_that_is_not_refined_stays(tmp_path):
     results = event_nerf.run(smoke(pose="linear", loss="window", out=tmp_path / "run")).results
     assert results["translation_error"] == pytest.approx(results["start"]["translation_error"], rel=1e-6)
@@ -176,6 +177,7 @@ def test_the_correction_undoes_a_slope_and_an_offset_of_log_intensity():
 
 
 @pytest.mark.data
+@pytest.mark.slow
 def test_real_events_with_known_poses(data_dir, tmp_path):
     results = event_nerf.run(smoke(data=data_dir / "ecd_slider_depth", out=tmp_path / "run")).results
     assert results["frames"]["psnr"] > 0 and results["psnr"] is None

@@ -255,6 +255,7 @@ def test_what_a_run_leaves(tmp_path):
     assert results["settled"]["psnr"] > 0 and results["wall_s"] > 0 and results["versions"]["jax"]
 
 
+@pytest.mark.slow
 def test_a_study_puts_runs_side_by_side(tmp_path, monkeypatch):
     every = STUDIES["fields"]
     two = lambda config: {name: every(config)[name] for name in ("table", "bspline")}
@@ -274,6 +275,7 @@ def test_a_study_puts_runs_side_by_side(tmp_path, monkeypatch):
 
 
 @pytest.mark.data
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scene", "noise", "views"), [("nerf_synthetic_lego", "independent", 8), ("llff_fern", "unknown", 8)]
 )
