@@ -2,10 +2,10 @@
 
 An event says that the log intensity of its pixel has changed by a threshold since the pixel's last event. So
 between any two of a pixel's events the change is known, whatever happened in other pixels: `by_pixel` puts
-events in that order, `change` reads it.
+events in that order, `level_at` reads it.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Literal, NamedTuple, TypeVar
 
 import jax
@@ -95,26 +95,7 @@ def simulate(
         if not t > t_before:
             raise DataError(f"simulate: expected stamps that increase, got {t:g} s after {t_before:g} s")
         now = np.asarray(image, np.float64).ravel()
-        slope = (now - before) / (t - t_before)
-        rested = (blind_until > -np.inf) & (blind_until <= t_before)  # nothing moved when they woke
-        level[rested], blind_until[rested] = before[rested], -np.inf
-        active = np.flatnonzero(slope)
-        while len(active):
-            # Pixels that have become able to see again count from where they are.
-            woken = active[blind_until[active] > t_before]
-            woken = woken[blind_until[woken] <= t]
-            level[woken] = before[woken] + slope[woken] * (blind_until[woken] - t_before)
-            blind_until[woken] = -np.inf
-            active = active[blind_until[active] <= t_before]
-            brighter = slope[active] > 0
-            target = level[active] + np.where(brighter, steps[0, active], -steps[1, active])
-            crossed = np.where(brighter, target <= now[active], target >= now[active])
-            active, target, brighter = active[crossed], target[crossed], brighter[crossed]
-            when = np.maximum(t_before + (target - before[active]) / slope[active], t_before)
-            parts.append((when, active, np.where(brighter, 1, -1).astype(np.int8)))
-            level[active] = target
-            if refractory_s > 0:
-                blind_until[active] = when + refractory_s
+        parts += _crossings(before, now, t_before, t, steps, level, blind_until, refractory_s)
         t_before, before = t, now
     if noise_hz > 0:
         count = generator.poisson(noise_hz * (t_before - t_first) * pixels)
@@ -128,6 +109,43 @@ def simulate(
     order = np.argsort(when, kind="stable")
     y, x = np.divmod(where[order], shape[1])
     return Events(when[order], x.astype(np.uint16), y.astype(np.uint16), polarity[order])
+
+
+def _crossings(
+    before: Float[np.ndarray, " n"],
+    now: Float[np.ndarray, " n"],
+    t_before: float,
+    t: float,
+    steps: Float[np.ndarray, "2 n"],
+    level: Float[np.ndarray, " n"],
+    blind_until: Float[np.ndarray, " n"],
+    refractory_s: float,
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Times, pixels and polarities of the events between two images, at most one a pixel at a time.
+
+    `steps` are the thresholds upwards and downwards. The levels that pixels count from, and the times until
+    which they are blind (-inf: they see), are brought up to date.
+    """
+    slope = (now - before) / (t - t_before)
+    rested = (blind_until > -np.inf) & (blind_until <= t_before)  # nothing moved when they woke
+    level[rested], blind_until[rested] = before[rested], -np.inf
+    active = np.flatnonzero(slope)
+    while len(active):
+        # Pixels that have become able to see again count from where they are.
+        woken = active[blind_until[active] > t_before]
+        woken = woken[blind_until[woken] <= t]
+        level[woken] = before[woken] + slope[woken] * (blind_until[woken] - t_before)
+        blind_until[woken] = -np.inf
+        active = active[blind_until[active] <= t_before]
+        brighter = slope[active] > 0
+        target = level[active] + np.where(brighter, steps[0, active], -steps[1, active])
+        crossed = np.where(brighter, target <= now[active], target >= now[active])
+        active, target, brighter = active[crossed], target[crossed], brighter[crossed]
+        when = np.maximum(t_before + (target - before[active]) / slope[active], t_before)
+        level[active] = target
+        if refractory_s > 0:
+            blind_until[active] = when + refractory_s
+        yield when, active, np.where(brighter, 1, -1).astype(np.int8)
 
 
 def by_pixel(events: Events, height: int, width: int) -> Streams:

@@ -78,7 +78,11 @@ def trainer(
         # Once for every image, not for every ray.
         T_world_cam = jax.vmap(field.pose, (None, 0))(pose_params, views.t)[view]
         rays = jax.vmap(partial(pixel_ray, camera))(T_world_cam, x, y)
-        batch = rays, _depths(depth_key, depths, config), _unit(views.rgb[view, y, x])
+        batch = (
+            rays,
+            draw_depths(depth_key, depths, rays=config.rays, samples=config.samples),
+            _unit(views.rgb[view, y, x]),
+        )
         return total(scene_params, batch) / (3 * config.rays)
 
     return joint(loss, scene.init, field.init, scene_rates, pose_rates, config.steps)
@@ -130,7 +134,11 @@ def viewer(
             x, y = _pixels(pixel_key, config.rays, *rgb.shape[:2])
             moved = se3.compose(se3.exp(twist), T_world_cam)
             rays = jax.vmap(partial(pixel_ray, camera, moved))(x, y)
-            batch = rays, _depths(depth_key, depths, config), _unit(rgb[y, x])
+            batch = (
+                rays,
+                draw_depths(depth_key, depths, rays=config.rays, samples=config.samples),
+                _unit(rgb[y, x]),
+            )
             return total((), batch) / (3 * config.rays)
 
         def step(carry, key):
@@ -186,11 +194,12 @@ def _pixels(
     return pixel % width, pixel // width
 
 
-def _depths(key: PRNGKeyArray, depths: Depths, config: TrainConfig) -> Float[Array, "r s"]:
-    draw = lambda key: render.sample_depths(
-        key, depths.near, depths.far, config.samples, spacing=depths.spacing
-    )
-    return jax.vmap(draw)(jax.random.split(key, config.rays))
+def draw_depths(
+    key: PRNGKeyArray, depths: Depths, *, rays: int, samples: int
+) -> Float[Array, "rays samples"]:
+    """Increasing depths for each of so many rays, drawn as `render.sample_depths` does."""
+    draw = lambda key: render.sample_depths(key, depths.near, depths.far, samples, spacing=depths.spacing)
+    return jax.vmap(draw)(jax.random.split(key, rays))
 
 
 def _unit(rgb: UInt8[Array, "*n 3"]) -> Float[Array, "*n 3"]:

@@ -13,11 +13,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from jaxpose import render
 from jaxpose.camera import Camera
 from jaxpose.events import Streams, change_residual, level_at
 from jaxpose.fields import PoseField
-from jaxpose.nerf import Depths, pixel_ray, ray_colour
+from jaxpose.nerf import Depths, draw_depths, pixel_ray, ray_colour
 from jaxpose.scenes import SceneField
 from jaxpose.train import Trainer, joint, sum_by_chunks
 
@@ -101,10 +100,7 @@ def trainer(
             T_now, T_before = poses(pairs.t_now), poses(pairs.t_before)
         x, y = pairs.pixel % camera.width, pairs.pixel // camera.width
         rays = [jax.vmap(partial(pixel_ray, camera))(T, x, y) for T in (T_now, T_before)]
-        sample = lambda key: render.sample_depths(
-            key, depths.near, depths.far, config.samples, spacing=depths.spacing
-        )
-        depth = jax.vmap(sample)(jax.random.split(depth_key, config.events))
+        depth = draw_depths(depth_key, depths, rays=config.events, samples=config.samples)
         change = config.threshold * pairs.change.astype(depth.dtype)
         mask = data.mask[pairs.pixel] * pairs.weight[:, None]
         return total(scene_params, (*rays, depth, change, mask)) / (3 * config.events)

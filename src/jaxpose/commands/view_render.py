@@ -34,13 +34,15 @@ def of_radiance(folder: Path, first: float) -> Render:
     """The radiance field of a NeRF run from where its pose field is `t` after `first` [s]."""
     experiment = json.loads((folder / "results.json").read_text()).get("experiment")
     if experiment == "event_nerf":
-        problem, setup, state = event_nerf.load_run(folder)
+        loaded = event_nerf.load_run(folder)
+        problem = loaded.problem
         camera, depths, background = problem.recording.camera, problem.depths, problem.background
     elif experiment == "noisy_nerf":
-        problem, setup, state = noisy_nerf.load_run(folder)
-        camera, depths, background = problem.train.camera, setup.depths, None
+        loaded = noisy_nerf.load_run(folder)
+        camera, depths, background = loaded.problem.train.camera, loaded.setup.depths, None
     else:
         raise DataError(f"{folder}: expected a run of noisy_nerf or event_nerf, got {experiment}")
+    setup, state = loaded.setup, loaded.state
     config = TrainConfig(steps=1, rays=1, samples=setup.train.samples, chunk=64)
     pose = jax.jit(partial(setup.field.pose, state.pose))
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxpose.data.event_beside import Source, load_source, with_camera
 from jaxpose.data.event_stream import BLOCK, Block, Stream, Unit
-from jaxpose.data.images import found, image_size, some
+from jaxpose.data.images import image_size, only, some
 from jaxpose.data.photographs import extent_depths, read_images
 from jaxpose.data.truth import poses_at
 from jaxpose.data.tum import Stamped, read_list
@@ -74,12 +74,7 @@ def _only_file(folder: Path) -> Path:
     files = sorted(folder.glob("events*.txt")) if folder.is_dir() else []
     if folder / "events.txt" in files:
         return folder / "events.txt"
-    if len(files) == 1:
-        return files[0]
-    several = f"{len(files)} files, name one of them: {some([file.name for file in files])}"
-    raise DataError(
-        f"{folder}: expected events.txt, or one events*.txt, got {several if files else found(folder)}"
-    )
+    return only(files, folder, "events.txt, or one events*.txt")
 
 
 def _blocks(file: Path) -> Iterator[Block]:

@@ -47,8 +47,7 @@ def clean(
     DataError naming file and line (or event) for what is refused, for NaN and infinity, for pixels that are
     no whole numbers, and for no event at all; ValueError for a span that does not rise.
     """
-    if span is not None and not span[0] < span[1]:
-        raise ValueError(f"span: expected two rising times [s], got {span[0]:g} and {span[1]:g}")
+    check_span(span)
     tally, columns = None, ([], [], [], [])
     for tally, block in tallied(stream, size, unit, zero):
         if tally.odd is not None:
@@ -72,6 +71,12 @@ def clean(
         order = np.argsort(t, kind="stable")
         t, x, y, polarity = t[order], x[order], y[order], polarity[order]
     return Read(Events(t, x, y, polarity), tally, _notes(stream, size, unit, tally))
+
+
+def check_span(span: tuple[float, float] | None) -> None:
+    """ValueError for a span that does not rise."""
+    if span is not None and not span[0] < span[1]:
+        raise ValueError(f"span: expected two rising times [s], got {span[0]:g} and {span[1]:g}")
 
 
 def _most_back(unit: Unit) -> float:

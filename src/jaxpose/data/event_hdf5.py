@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxpose.data.event_beside import Source, load_source, with_camera
 from jaxpose.data.event_stream import BLOCK, Block, Stream, Unit
-from jaxpose.data.images import found, some
+from jaxpose.data.images import only, some
 from jaxpose.errors import DataError
 from jaxpose.events import Mosaic
 from jaxpose.recording import EventRecording
@@ -64,11 +64,7 @@ def _files(folder: Path) -> list[Path]:
 def _file(path: Path) -> Path:
     if path.is_file():
         return path
-    files = _files(path)
-    if len(files) == 1:
-        return files[0]
-    several = f"{len(files)} files, name one of them: {some([file.name for file in files])}"
-    raise DataError(f"{path}: expected one HDF5 file of events, got {several if files else found(path)}")
+    return only(_files(path), path, "one HDF5 file of events")
 
 
 def _blocks(file: Path) -> Iterator[Block]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxpose.data.event_beside import Source, load_source, with_camera
 from jaxpose.data.event_stream import BLOCK, Block, Stream, Unit
-from jaxpose.data.images import found, some
+from jaxpose.data.images import only, some
 from jaxpose.errors import DataError
 from jaxpose.events import Mosaic
 from jaxpose.recording import EventRecording
@@ -59,12 +59,7 @@ def _file(path: Path) -> Path:
     if path.is_file():
         return path
     files = [file for file in sorted(path.glob("*.npz")) if _names(file) is not None]
-    if len(files) == 1:
-        return files[0]
-    several = f"{len(files)} files, name one of them: {some([file.name for file in files])}"
-    raise DataError(
-        f"{path}: expected one npz file with arrays x y t p, got {several if files else found(path)}"
-    )
+    return only(files, path, "one npz file with arrays x y t p")
 
 
 def _names(file: Path) -> tuple[str, ...] | None:

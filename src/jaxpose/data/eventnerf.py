@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from jaxpose.camera import Camera
 from jaxpose.data.event_beside import Source, check_mosaic
-from jaxpose.data.event_clean import clean
+from jaxpose.data.event_clean import check_span, clean
 from jaxpose.data.event_npz import npz_stream
 from jaxpose.data.event_stream import Unit
 from jaxpose.data.images import SUFFIXES, check_intrinsics, common_size, found, name_of
@@ -223,8 +223,7 @@ def _held_out(split: Path) -> tuple[Photographs | None, tuple[str, ...]]:
 
 def _within(file: Path, events: Events, span: tuple[float, float]) -> Events:
     """The events from span[0] to before span[1] [s]."""
-    if not span[0] < span[1]:
-        raise ValueError(f"span: expected two rising times [s], got {span[0]:g} and {span[1]:g}")
+    check_span(span)
     first, last = np.searchsorted(events.t, span)
     if first == last:
         raise DataError(f"{file}: expected events, got none from {span[0]:g} to {span[1]:g} s")

@@ -8,35 +8,26 @@ known instants (table 4), `--study offset` for a turntable whose axis is wrong.
 
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
-from jaxpose import command, io, io_checkpoint, metrics, plots_events, plots_nerf
+from jaxpose import command, io, metrics, plots_events, plots_nerf
 from jaxpose.experiments import joint_loop
 from jaxpose.experiments.event_nerf_measure import PROTOCOL, Measured, Truth, find_truth, measure
-from jaxpose.experiments.event_nerf_options import Config, Problem, Study, decisive, load
-from jaxpose.experiments.event_nerf_report import Progress, progress_bar, report, table
+from jaxpose.experiments.event_nerf_options import Config, Problem, Study, begin, decisive, load, read
+from jaxpose.experiments.event_nerf_report import progress_bar, report, table
 from jaxpose.experiments.event_nerf_setup import Setup, build, describe
-from jaxpose.fields import set_progress
+from jaxpose.experiments.joint_loop import Loaded, OnProgress, Outcome, Trained
 from jaxpose.io_camera import write_camera
 from jaxpose.io_field import write_field
 from jaxpose.train import State
 
-OnProgress = Callable[[Progress], None]
 _KNOWN = (20, 10, 6)  # table 4
 _OFFSETS_DEG = (1.0, 2.0, 2.85)  # EventNeRF reports up to 2.85 on real turntables
-
-
-class Outcome(NamedTuple):
-    """Where a run was written, and its results; those of a study under `runs`, by label."""
-
-    folder: Path
-    results: dict[str, Any]
 
 
 def run(config: Config, on_progress: OnProgress | None = None) -> Outcome:
@@ -45,7 +36,8 @@ def run(config: Config, on_progress: OnProgress | None = None) -> Outcome:
     Raises DataError or OSError for what cannot be used; then no folder is left behind.
     """
     started = time.perf_counter()
-    problem = load(config)
+    recording = read(config)
+    problem = begin(config, recording)
     folder = io.run_folder("event_nerf", name=config.name, out=config.out)
     if config.study is None:
         return Outcome(folder, _single(config, problem, folder, on_progress, ""))
@@ -54,46 +46,13 @@ def run(config: Config, on_progress: OnProgress | None = None) -> Outcome:
         inner = folder / label
         inner.mkdir(exist_ok=True)
         changed = replace(changed, study=None)
-        results[label] = _single(changed, load(changed), inner, on_progress, label)
-    whole = {
-        "experiment": "event_nerf",
-        "study": config.study,
-        "seed": config.seed,
-        "smoke": config.smoke,
-        "runs": results,
-        "versions": io.versions(),
-        "wall_s": time.perf_counter() - started,
-        "peak_rss_bytes": io.peak_rss_bytes(),
-    }
-    io.write_json(folder / "config.json", config)
-    io.write_text(folder / "table.md", table(results) + "\n")
-    io.write_json(folder / "results.json", whole)
-    return Outcome(folder, whole)
+        results[label] = _single(changed, begin(changed, recording), inner, on_progress, label)
+    return joint_loop.write_study(folder, "event_nerf", config, results, table(results), started)
 
 
-class Loaded(NamedTuple):
-    """A finished run: `setup.field.pose(state.pose, t)` is the camera's pose at any time [s], and
-    `setup.scene.query(state.scene, point, direction)` the density and colour of the scene."""
-
-    problem: Problem
-    setup: Setup
-    state: State
-
-
-def load_run(folder: Path | str) -> Loaded:
-    """The scene and the trajectory that a run has left in its folder; its data are read again.
-
-    DataError or OSError for a folder that holds no run.
-    """
-    settings = json.loads((Path(folder) / "settings.json").read_text())
-    config = Config(
-        **settings | {"data": Path(settings["data"]), "net": joint_loop.net_config(settings["net"])}
-    )
-    problem = load(config)
-    setup = build(config, problem)
-    start = joint_loop.fresh(setup.trainer, setup.train.steps, config.seed)
-    state = io_checkpoint.load(Path(folder) / "checkpoint.npz", start).state
-    return Loaded(problem, setup, state._replace(scene=set_progress(state.scene, jnp.ones(()))))
+def load_run(folder: Path | str) -> Loaded[Problem, Setup]:
+    """What a run has left in its folder, as `joint_loop.load_run`."""
+    return joint_loop.load_run(folder, Config, load, build)
 
 
 def main(args: Sequence[str] | None = None) -> None:
@@ -130,23 +89,16 @@ def _single(
     measured = measure(problem, setup, trained.state, truth)
     _draw(folder, config, problem, measured, truth)
     _write_poses(folder, problem, setup, trained.state, measured)
-    seconds = float(trained.history[-1, -1])
-    results = {
-        "experiment": "event_nerf",
-        "data": problem.about,
-        "training": describe(config, setup),
-        "protocol": PROTOCOL,
-        "seed": config.seed,
-        "smoke": config.smoke,
+    results = joint_loop.results_of(
+        "event_nerf",
+        config,
+        trained,
+        started,
+        data=problem.about,
+        training=describe(config, setup),
+        protocol=PROTOCOL,
         **measured.numbers,
-        "train_s": seconds,
-        "seconds_per_step": seconds / setup.train.steps,
-        "history_columns": joint_loop.COLUMNS,
-        "history": trained.history,
-        "versions": io.versions(),
-        "wall_s": time.perf_counter() - started,
-        "peak_rss_bytes": io.peak_rss_bytes(),
-    }
+    )
     io.write_json(finished, results)  # last: with it the run counts as finished
     return results
 
@@ -159,25 +111,22 @@ def _train(
     checkpoint: Path,
     on_progress: OnProgress | None,
     label: str,
-) -> joint_loop.Trained:
+) -> Trained:
     if truth is None:
         errors = lambda params: (np.nan, np.nan)
     else:
         poses = joint_loop.pose_reader(setup.field, truth.t)
         errors = lambda params: joint_loop.mean_errors(poses(params), truth.T_world_cam)
 
-    def on_row(row):
-        if on_progress is not None:
-            step, loss, rotation_deg, translation, _ = row
-            on_progress(Progress(label, setup.train.steps, int(step), loss, rotation_deg, translation))
-
     return joint_loop.train(
-        setup.trainer,
-        joint_loop.fresh(setup.trainer, setup.train.steps, config.seed),
+        setup,
+        joint_loop.fresh(setup, config.seed),
         setup.data,
         errors,
         checkpoint,
-        on_row,
+        on_progress,
+        label=label,
+        extent=problem.extent,
     )
 
 

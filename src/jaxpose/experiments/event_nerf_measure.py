@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from jaxpose import events_motion, metrics, nerf
@@ -14,11 +14,9 @@ from jaxpose.events import GAMMA, log_intensity
 from jaxpose.experiments.event_nerf_options import Problem
 from jaxpose.experiments.event_nerf_setup import Setup
 from jaxpose.experiments.joint_loop import pose_reader
-from jaxpose.experiments.noisy_nerf_measure import pose_numbers
-from jaxpose.fields import PoseField, set_progress, stamped
-from jaxpose.io import Trajectory
+from jaxpose.experiments.joint_measure import likeness, means, pose_numbers
+from jaxpose.fields import set_progress, stamped
 from jaxpose.metrics import PoseErrors, Similarity
-from jaxpose.metrics_image import lpips, ssim
 from jaxpose.nerf import TrainConfig
 from jaxpose.plots_nerf import HeldOut
 from jaxpose.recording import Photographs, take
@@ -70,19 +68,20 @@ def find_truth(problem: Problem) -> Truth | None:
     if len(during) < 3:
         return None
     at = during[np.unique(np.linspace(0, len(during) - 1, min(len(during), _MOST_POSES)).round().astype(int))]
-    start = PoseField(lambda key: (), lambda params, t: stamped(*_arrays(problem.start))(t))
-    return Truth(recording.t[at], recording.T_world_cam[at], pose_reader(start, recording.t[at])(()))
+    start = stamped(*(jnp.asarray(x, jnp.float32) for x in problem.start))
+    T_start = jax.jit(jax.vmap(start))(jnp.asarray(recording.t[at], jnp.float32))
+    return Truth(recording.t[at], recording.T_world_cam[at], np.asarray(T_start, np.float64))
 
 
 def measure(problem: Problem, setup: Setup, state: State, truth: Truth | None) -> Measured:
     """Errors of the trained trajectory, what the scene shows, and how sharp the motion makes the events."""
     scene = set_progress(state.scene, jnp.ones(()))
-    look = lambda camera, samples: nerf.viewer(
-        setup.scene, camera, problem.depths, TrainConfig(steps=1, rays=1, samples=samples, chunk=64),
-        background=problem.background,
-    ).image  # fmt: skip
-    samples = 2 * setup.train.samples
-    camera, recording = problem.recording.camera, problem.recording
+    recording = problem.recording
+    # Twice as finely as in training, whose samples are drawn anew in every step.
+    finely = TrainConfig(steps=1, rays=1, samples=2 * setup.train.samples, chunk=64)
+    look = lambda camera: (
+        nerf.viewer(setup.scene, camera, problem.depths, finely, background=problem.background).image
+    )
     at_start = at_end = None
     numbers: dict[str, Any] = {}
     to_truth = Similarity(1.0, np.eye(3), np.zeros(3))
@@ -100,7 +99,7 @@ def measure(problem: Problem, setup: Setup, state: State, truth: Truth | None) -
         if recording.held_out is not None:
             to_estimate = metrics.procrustes(truth.T_world_cam, estimate)
             poses = metrics.align(to_estimate, recording.held_out.T_world_cam)
-            views = _seen(look(recording.held_out.camera, samples), scene, recording.held_out, poses, setup)
+            views = _seen(look(recording.held_out.camera), scene, recording.held_out, poses, setup)
             seen = _alike(views)
     numbers |= seen
     frames = []
@@ -109,10 +108,10 @@ def measure(problem: Problem, setup: Setup, state: State, truth: Truth | None) -
         photographs = take(recording.frames, np.flatnonzero(inside))
         if len(photographs.t):
             poses = pose_reader(setup.field, photographs.t)(state.pose)
-            frames = _seen(look(camera, samples), scene, photographs, poses, setup)
+            frames = _seen(look(recording.camera), scene, photographs, poses, setup)
             numbers["frames"] = _alike(frames)
     if problem.slides:
-        numbers["slide"] = _slide(problem, setup, state, scene, truth, look(camera, samples))
+        numbers["slide"] = _slide(problem, setup, state, scene, truth, look(recording.camera))
     return Measured(numbers, views, frames, at_start, at_end, to_truth)
 
 
@@ -159,14 +158,7 @@ def _seen(
 
 
 def _alike(views: list[HeldOut]) -> dict[str, float | None]:
-    """Means over views."""
-    pairs = [(view.rendered_rgb, view.rgb / 255) for view in views]
-    perceptual = [value for image, photograph in pairs if (value := lpips(image, photograph)) is not None]
-    return {
-        "psnr": float(np.mean([metrics.psnr(*pair) for pair in pairs])),
-        "ssim": float(np.mean([ssim(*pair) for pair in pairs])),
-        "lpips": float(np.mean(perceptual)) if perceptual else None,
-    }
+    return means([likeness(view.rendered_rgb, view.rgb / 255) for view in views])
 
 
 def _slide(
@@ -206,7 +198,3 @@ def _slide(
 
 def _angle_deg(a: Float[np.ndarray, "3"], b: Float[np.ndarray, "3"]) -> float:
     return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
-
-
-def _arrays(start: Trajectory) -> list[Float[Array, "..."]]:
-    return [jnp.asarray(x, jnp.float32) for x in start]

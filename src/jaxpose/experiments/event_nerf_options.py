@@ -10,6 +10,7 @@ from jaxtyping import Float
 from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 
+from jaxpose.command import check_least, check_resume
 from jaxpose.data import event_orbit, event_recordings
 from jaxpose.data.orbit import DIAMETER, FAR, NEAR
 from jaxpose.errors import DataError
@@ -60,13 +61,7 @@ class Config:
     name: str | None = None  # of the run folder
 
     def __post_init__(self):
-        for option, least in (
-            ("known", 2), ("axis_offset_deg", 0), ("seed", 0), ("image_width", 8), ("steps", CHUNK),
-            ("events", 1),
-        ):  # fmt: skip
-            value = getattr(self, option)
-            if value is not None and not least <= value < math.inf:
-                raise ValueError(f"--{option.replace('_', '-')}: expected at least {least}, got {value}")
+        check_least(self, known=2, axis_offset_deg=0, seed=0, image_width=8, steps=CHUNK, events=1)
         if self.threshold is not None and not 0 < self.threshold < math.inf:
             raise ValueError(f"--threshold: expected a positive number, got {self.threshold}")
         if self.axis_offset_deg >= 45:
@@ -77,8 +72,7 @@ class Config:
             raise ValueError("--poses unknown: expected neither --known nor --axis-offset-deg with it")
         if self.poses == "unknown" and self.data == ORBIT:
             raise ValueError("--poses unknown: expected --data with a short recording, got the orbit")
-        if self.resume and self.out is None and self.name is None:
-            raise ValueError("--resume: expected --out DIR or --name NAME with it")
+        check_resume(self)
 
 
 # What a run's numbers do not depend on.
@@ -105,17 +99,22 @@ class Problem(NamedTuple):
 
 
 def load(config: Config) -> Problem:
-    """Read or make the events, and the poses to start from.
+    """The events, and the poses to start from: `begin` with what `read` has read."""
+    return begin(config, read(config))
 
-    DataError or OSError for what cannot be used.
-    """
-    orbiting = config.data == ORBIT
-    if orbiting:
+
+def read(config: Config) -> EventRecording:
+    """Read or make the events. DataError or OSError for what cannot be used."""
+    if config.data == ORBIT:
         width = _SMOKE_WIDTH if config.smoke else config.image_width or _WIDTH
         poses = _SMOKE_POSES if config.smoke else 1000
-        recording = event_orbit.event_orbit(width, config.seed, poses=poses, mosaic=config.mosaic or "rggb")
-    else:
-        recording = event_recordings.load(config.data, mosaic=config.mosaic)
+        return event_orbit.event_orbit(width, config.seed, poses=poses, mosaic=config.mosaic or "rggb")
+    return event_recordings.load(config.data, mosaic=config.mosaic)
+
+
+def begin(config: Config, recording: EventRecording) -> Problem:
+    """What of the recording's poses the training is told. DataError where it cannot be told."""
+    orbiting = config.data == ORBIT
     if len(recording.events.t) == 0:
         raise DataError(f"{config.data}: expected events, got none")
     began = _unknown(recording) if config.poses == "unknown" else _known(config, recording, orbiting)

@@ -1,10 +1,11 @@
 """What the event experiment says: a bar while it trains, then numbers with their protocol."""
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-from jaxpose.command import markdown_table, step_bar
+from jaxpose.command import markdown_table, number
+from jaxpose.experiments import joint_loop
+from jaxpose.experiments.joint_loop import OnProgress, Progress
 
 _COLUMNS: tuple[str, ...] = (
     "run", "RE start", "RE [deg]", "TE start", "TE [units]", "TE [%]", "PSNR [dB]", "SSIM", "LPIPS",
@@ -12,31 +13,14 @@ _COLUMNS: tuple[str, ...] = (
 )  # fmt: skip
 
 
-class Progress(NamedTuple):
-    """Where a training is: after `step` of `steps`."""
-
-    label: str
-    steps: int
-    step: int
-    loss: float
-    rotation_deg: float
-    translation: float  # [scene units]
-
-
-def progress_bar() -> Callable[[Progress], None]:
+def progress_bar() -> OnProgress:
     """A callback for `run` that draws a bar on stderr for each training."""
-    bar = step_bar()
 
-    def on_progress(progress: Progress) -> None:
+    def describe(progress: Progress) -> dict[str, str]:
         off = f"{progress.rotation_deg:.2f} deg {progress.translation:.4f} units"
-        bar(
-            progress.label or "training",
-            progress.step,
-            progress.steps,
-            {"loss": f"{progress.loss:.5f}", "off": off},
-        )
+        return {"loss": f"{progress.loss:.5f}", "off": off}
 
-    return on_progress
+    return joint_loop.progress_bar(describe)
 
 
 def table(runs: dict[str, dict[str, Any]]) -> str:
@@ -44,14 +28,14 @@ def table(runs: dict[str, dict[str, Any]]) -> str:
     rows = [_COLUMNS] + [
         (
             label,
-            _number(run.get("start", {}).get("rotation_error_deg"), 3),
-            _number(run.get("rotation_error_deg"), 3),
-            _number(run.get("start", {}).get("translation_error"), 4),
-            _number(run.get("translation_error"), 4),
-            _number(run.get("translation_error_percent"), 3),
-            _number(run["psnr"], 2),
-            _number(run["ssim"], 3),
-            _number(run["lpips"], 3),
+            number(run.get("start", {}).get("rotation_error_deg"), 3),
+            number(run.get("rotation_error_deg"), 3),
+            number(run.get("start", {}).get("translation_error"), 4),
+            number(run.get("translation_error"), 4),
+            number(run.get("translation_error_percent"), 3),
+            number(run["psnr"], 2),
+            number(run["ssim"], 3),
+            number(run["lpips"], 3),
             f"{run['train_s']:.0f}",
         )
         for label, run in runs.items()
@@ -111,7 +95,3 @@ def _beside(run: dict[str, Any]) -> list[str]:
                 f"{slide['start_direction_error_deg']:.2f} at the start"
             )
     return lines
-
-
-def _number(value: float | None, digits: int) -> str:
-    return "n/a" if value is None else f"{value:.{digits}f}"

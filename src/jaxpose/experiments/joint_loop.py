@@ -1,11 +1,11 @@
-"""What trainings on photographs and on events share: the loop over chunks of steps, checkpoints, resuming."""
+"""What trainings on photographs and on events share: the loop, its progress, checkpoints, the run folder."""
 
 import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from jaxpose import command, io, io_checkpoint, metrics
 from jaxpose.errors import DataError
-from jaxpose.fields import PoseField
+from jaxpose.fields import PoseField, set_progress
 from jaxpose.nn import Activation
 from jaxpose.train import State, Trainer
 
@@ -35,6 +35,28 @@ class NetConfig:
     window: tuple[float, float] | None = None  # coarse-to-fine on the time encoding, shares of the training
 
 
+class Progress(NamedTuple):
+    """Where a training is: after `step` of `steps`."""
+
+    label: str
+    steps: int
+    extent: float  # of the cameras' way [scene units]
+    step: int
+    loss: float
+    rotation_deg: float
+    translation: float  # [scene units]
+
+
+OnProgress = Callable[[Progress], None]
+
+
+class Outcome(NamedTuple):
+    """Where a run was written, and its results; those of a study under `runs`, by label."""
+
+    folder: Path
+    results: dict[str, Any]
+
+
 class Trained(NamedTuple):
     """Where a training stands, and how it went there: rows of `COLUMNS`, NaN where it has not been."""
 
@@ -42,26 +64,46 @@ class Trained(NamedTuple):
     history: Float[np.ndarray, "c 5"]
 
 
-def fresh(trainer: Trainer, steps: int, seed: int) -> Trained:
+@runtime_checkable
+class _Train(Protocol):
+    @property
+    def steps(self) -> int: ...
+
+
+@runtime_checkable
+class Setup(Protocol):
+    """What both experiments' setups have beside their own."""
+
+    @property
+    def trainer(self) -> Trainer: ...
+
+    @property
+    def train(self) -> _Train: ...
+
+
+def fresh(setup: Setup, seed: int) -> Trained:
     """A training at its start."""
-    return Trained(trainer.start(jax.random.key(seed)), np.full((steps // CHUNK, len(COLUMNS)), np.nan))
+    history = np.full((setup.train.steps // CHUNK, len(COLUMNS)), np.nan)
+    return Trained(setup.trainer.start(jax.random.key(seed)), history)
 
 
 def train(
-    trainer: Trainer,
+    setup: Setup,
     trained: Trained,
     data: Any,
     errors: Callable[[Any], tuple[float, float]],
     checkpoint: Path,
-    on_row: Callable[[Float[np.ndarray, "5"]], None],
+    on_progress: OnProgress | None,
     *,
+    label: str,
+    extent: float,
     between: Callable[[State], State] = lambda state: state,
 ) -> Trained:
     """Train to the end, from the checkpoint if there is one, and keep one as it goes.
 
     `errors` gives rotation [deg] and translation errors of the pose field's parameters, `between` changes the
-    state after every chunk.
-    DataError where the loss is no longer a number.
+    state after every chunk; `label` and `extent` are for the progress. DataError where the loss is no longer
+    a number.
     """
     if checkpoint.exists():
         trained = io_checkpoint.load(checkpoint, trained)
@@ -70,7 +112,7 @@ def train(
     before = history[done - 1, -1] if done else 0.0
     started = saved = time.perf_counter()
     for chunk in range(done, len(history)):
-        state, losses = trainer.advance(state, data, CHUNK)
+        state, losses = setup.trainer.advance(state, data, CHUNK)
         state = between(state)
         step, loss = (chunk + 1) * CHUNK, float(losses.mean())
         if not np.isfinite(loss):
@@ -81,7 +123,8 @@ def train(
         if now - saved > _SAVE_EVERY_S or chunk + 1 == len(history):
             io_checkpoint.save(checkpoint, Trained(state, history))
             saved = now
-        on_row(history[chunk])
+        if on_progress is not None:
+            on_progress(Progress(label, setup.train.steps, extent, step, loss, *found))
     return Trained(state, history)
 
 
@@ -111,10 +154,91 @@ def mean_errors(
     return found.rotation_deg, found.translation
 
 
-def net_config(settings: dict[str, Any]) -> NetConfig:
-    """PoseNet's variant from what `prepare` wrote."""
-    window = settings.pop("window")
-    return NetConfig(**settings, window=window and tuple(window))
+def progress_bar(describe: Callable[[Progress], dict[str, str]]) -> OnProgress:
+    """A callback that draws a bar on stderr for each training, with what `describe` says of it."""
+    bar = command.step_bar()
+    return lambda progress: bar(
+        progress.label or "training", progress.step, progress.steps, describe(progress)
+    )
+
+
+def results_of(
+    experiment: str, config: Any, trained: Trained, started: float, **found: Any
+) -> dict[str, Any]:
+    """What `results.json` of a run holds: what was `found`, and how it was trained and measured."""
+    steps, *_, seconds = trained.history[-1]
+    return {
+        "experiment": experiment,
+        "seed": config.seed,
+        "smoke": config.smoke,
+        **found,
+        "train_s": seconds,
+        "seconds_per_step": seconds / steps,
+        "history_columns": COLUMNS,
+        "history": trained.history,
+        **_cost(started),
+    }
+
+
+def write_study(
+    folder: Path, experiment: str, config: Any, runs: dict[str, dict[str, Any]], table: str, started: float
+) -> Outcome:
+    """Leave in the folder what runs side by side have found."""
+    whole = {
+        "experiment": experiment,
+        "study": config.study,
+        "seed": config.seed,
+        "smoke": config.smoke,
+        "runs": runs,
+        **_cost(started),
+    }
+    io.write_json(folder / "config.json", config)
+    io.write_text(folder / "table.md", table + "\n")
+    io.write_json(folder / "results.json", whole)
+    return Outcome(folder, whole)
+
+
+P = TypeVar("P")
+S = TypeVar("S", bound=Setup)
+
+
+@dataclass(frozen=True)
+class Loaded(Generic[P, S]):
+    """A finished run: `setup.field.pose(state.pose, t)` is the camera's pose at any time [s], and
+    `setup.scene.query(state.scene, point, direction)` the density and colour of the scene."""
+
+    problem: P
+    setup: S
+    state: State
+
+
+def load_run(
+    folder: Path | str,
+    config_type: Callable[..., Any],
+    load: Callable[[Any], P],
+    build: Callable[[Any, P], S],
+) -> Loaded[P, S]:
+    """The scene and the trajectory that a run has left in its folder; its data are read again.
+
+    DataError or OSError for a folder that holds no run.
+    """
+    settings = json.loads((Path(folder) / "settings.json").read_text())
+    net, window = settings["net"], settings["net"]["window"]
+    net = NetConfig(**net | {"window": window and tuple(window)})
+    config = config_type(**settings | {"data": Path(settings["data"]), "net": net})
+    problem = load(config)
+    setup = build(config, problem)
+    state = io_checkpoint.load(Path(folder) / "checkpoint.npz", fresh(setup, config.seed)).state
+    scene = set_progress(state.scene, jnp.ones(()))
+    return Loaded(problem, setup, state._replace(scene=scene))
+
+
+def _cost(started: float) -> dict[str, Any]:
+    return {
+        "versions": io.versions(),
+        "wall_s": time.perf_counter() - started,
+        "peak_rss_bytes": io.peak_rss_bytes(),
+    }
 
 
 def _plain(value: Any) -> Any:

@@ -8,20 +8,19 @@ by side.
 
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import imageio.v3 as imageio
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxpose import command, io, io_checkpoint, nerf, plots_nerf
+from jaxpose import command, io, plots_nerf
 from jaxpose.data import blender
 from jaxpose.experiments import joint_loop
-from jaxpose.experiments.joint_loop import Trained
+from jaxpose.experiments.joint_loop import Loaded, OnProgress, Outcome, Trained
 from jaxpose.experiments.noisy_nerf_measure import PROTOCOL, Measured, measure
 from jaxpose.experiments.noisy_nerf_options import (
     ORBIT,
@@ -30,24 +29,13 @@ from jaxpose.experiments.noisy_nerf_options import (
     decisive,
     load,
 )
-from jaxpose.experiments.noisy_nerf_report import Progress, progress_bar, report, table
+from jaxpose.experiments.noisy_nerf_report import progress_bar, report, table
 from jaxpose.experiments.noisy_nerf_setup import Setup, build, describe, splined
 from jaxpose.experiments.noisy_nerf_studies import STUDIES
-from jaxpose.fields import set_progress
 from jaxpose.io_camera import write_camera
 from jaxpose.io_field import write_field
 from jaxpose.io_transforms import write_transforms
 from jaxpose.plots_nerf import History
-from jaxpose.train import State, Trainer
-
-OnProgress = Callable[[Progress], None]
-
-
-class Outcome(NamedTuple):
-    """Where a run was written, and its results; those of a study under `runs`, by label."""
-
-    folder: Path
-    results: dict[str, Any]
 
 
 def run(config: Config, on_progress: OnProgress | None = None) -> Outcome:
@@ -66,21 +54,8 @@ def run(config: Config, on_progress: OnProgress | None = None) -> Outcome:
         inner.mkdir(exist_ok=True)
         results[label] = _single(replace(changed, study=None), problem, inner, on_progress, label)
         histories[label] = _history(np.array(results[label]["history"], float))
-    whole = {
-        "experiment": "noisy_nerf",
-        "study": config.study,
-        "seed": config.seed,
-        "smoke": config.smoke,
-        "runs": results,
-        "versions": io.versions(),
-        "wall_s": time.perf_counter() - started,
-        "peak_rss_bytes": io.peak_rss_bytes(),
-    }
     plots_nerf.curves(folder / "curves.png", histories, f"{_title(problem)}: {config.study}")
-    io.write_json(folder / "config.json", config)
-    io.write_text(folder / "table.md", table(results) + "\n")
-    io.write_json(folder / "results.json", whole)
-    return Outcome(folder, whole)
+    return joint_loop.write_study(folder, "noisy_nerf", config, results, table(results), started)
 
 
 def train(
@@ -92,7 +67,6 @@ def train(
     label: str,
 ) -> Trained:
     """Train to the end, from the checkpoint if there is one, and keep one as it goes."""
-    trainer = _trainer(problem, setup)
     poses = joint_loop.pose_reader(setup.field, problem.train.t)
 
     def between(state):
@@ -101,60 +75,22 @@ def train(
         smooth = splined(state.pose, problem.train.t, config.spline_knots, config.spline_smoothing)
         return state._replace(pose=smooth)
 
-    def on_row(row):
-        step, loss, rotation_deg, translation, _ = row
-        if on_progress is not None:
-            on_progress(
-                Progress(label, setup.train.steps, problem.extent, int(step), loss, rotation_deg, translation)
-            )
-
     return joint_loop.train(
-        trainer,
-        joint_loop.fresh(trainer, setup.train.steps, config.seed),
+        setup,
+        joint_loop.fresh(setup, config.seed),
         setup.views,
         lambda params: joint_loop.mean_errors(poses(params), problem.train.T_world_cam),
         checkpoint,
-        on_row,
+        on_progress,
+        label=label,
+        extent=problem.extent,
         between=between,
     )
 
 
-class Loaded(NamedTuple):
-    """A finished run: `setup.field.pose(state.pose, t)` is the camera's pose at any time [s], and
-    `setup.scene.query(state.scene, point, direction)` the density and colour of the scene."""
-
-    problem: Problem
-    setup: Setup
-    state: State
-
-
-def load_run(folder: Path | str) -> Loaded:
-    """The scene and the trajectory that a run has left in its folder; its data are read again.
-
-    DataError or OSError for a folder that holds no run.
-    """
-    settings = json.loads((Path(folder) / "settings.json").read_text())
-    config = Config(
-        **settings | {"data": Path(settings["data"]), "net": joint_loop.net_config(settings["net"])}
-    )
-    problem = load(config)
-    setup = build(config, problem)
-    start = joint_loop.fresh(_trainer(problem, setup), setup.train.steps, config.seed)
-    state = io_checkpoint.load(Path(folder) / "checkpoint.npz", start).state
-    scene = set_progress(state.scene, jnp.ones(()))
-    return Loaded(problem, setup, state._replace(scene=scene))
-
-
-def _trainer(problem: Problem, setup: Setup) -> Trainer:
-    return nerf.trainer(
-        setup.scene,
-        setup.field,
-        problem.train.camera,
-        setup.depths,
-        setup.scene_rates,
-        setup.pose_rates,
-        setup.train,
-    )
+def load_run(folder: Path | str) -> Loaded[Problem, Setup]:
+    """What a run has left in its folder, as `joint_loop.load_run`."""
+    return joint_loop.load_run(folder, Config, load, build)
 
 
 def main(args: Sequence[str] | None = None) -> None:
@@ -181,23 +117,16 @@ def _single(
     span = (float(problem.train.t[0]), float(problem.train.t[-1]))
     factors = setup.factors(trained.state.pose)
     write_field(folder / "field.npz", span, factors, alignment=measured.alignment)
-    seconds = float(trained.history[-1, -1])
-    results = {
-        "experiment": "noisy_nerf",
-        "data": problem.about,
-        "training": describe(config, setup),
-        "protocol": PROTOCOL,
-        "seed": config.seed,
-        "smoke": config.smoke,
+    results = joint_loop.results_of(
+        "noisy_nerf",
+        config,
+        trained,
+        started,
+        data=problem.about,
+        training=describe(config, setup),
+        protocol=PROTOCOL,
         **measured.numbers,
-        "train_s": seconds,
-        "seconds_per_step": seconds / setup.train.steps,
-        "history_columns": joint_loop.COLUMNS,
-        "history": trained.history,
-        "versions": io.versions(),
-        "wall_s": time.perf_counter() - started,
-        "peak_rss_bytes": io.peak_rss_bytes(),
-    }
+    )
     io.write_json(finished, results)  # last: with it the run counts as finished
     return results
 

@@ -1,6 +1,5 @@
 """Options of the noisy-pose experiment, and the photographs and disturbed poses that they name."""
 
-import math
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -9,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.distance import pdist
 
+from jaxpose.command import check_least, check_resume
 from jaxpose.data import blender, llff, noise
 from jaxpose.data.orbit import DIAMETER, orbit
 from jaxpose.errors import DataError
@@ -57,22 +57,18 @@ class Config:
     name: str | None = None  # of the run folder
 
     def __post_init__(self):
-        for option, least in (
-            ("noise_translation", 0), ("noise_rotation_deg", 0), ("noise_sigma", 0), ("seed", 0),
-            ("settle_steps", 0), ("spline_smoothing", 0), ("every", 1), ("orbit_views", 4),
-            ("image_width", 8), ("steps", CHUNK), ("rays", 1), ("spline_knots", 2),
-        ):  # fmt: skip
-            value = getattr(self, option)
-            if value is not None and not least <= value < math.inf:
-                raise ValueError(f"--{option.replace('_', '-')}: expected at least {least}, got {value}")
+        check_least(
+            self,
+            noise_translation=0, noise_rotation_deg=0, noise_sigma=0, seed=0, settle_steps=0,
+            spline_smoothing=0, every=1, orbit_views=4, image_width=8, steps=CHUNK, rays=1, spline_knots=2,
+        )  # fmt: skip
         if self.spline_smoothing == 0:
             raise ValueError("--spline-smoothing: expected a positive number, got 0")
         if self.noise_rotation_deg > 180:
             raise ValueError(f"--noise-rotation-deg: expected at most 180, got {self.noise_rotation_deg:g}")
         if self.steps is not None and self.steps % CHUNK:
             raise ValueError(f"--steps: expected a multiple of {CHUNK}, got {self.steps}")
-        if self.resume and self.out is None and self.name is None:
-            raise ValueError("--resume: expected --out DIR or --name NAME with it")
+        check_resume(self)
 
 
 # What a run's numbers do not depend on.
