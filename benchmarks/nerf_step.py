@@ -17,7 +17,8 @@ from timing import in_turn, machine, milliseconds, product_gflops
 
 from jaxpose import fields, io, nerf, scenes
 from jaxpose.camera import Camera
-from jaxpose.nerf import Depths, Rate, TrainConfig, Views
+from jaxpose.nerf import Depths, TrainConfig, Views
+from jaxpose.train import Rate, Trainer
 
 SIZE, IMAGES = 400, 100
 CAMERA = Camera(555.6, 555.6, 199.5, 199.5, SIZE, SIZE)
@@ -34,7 +35,7 @@ class Config:
     repeats: int = 5
 
 
-def trainer(pose: str, config: TrainConfig) -> nerf.Trainer:
+def trainer(pose: str, config: TrainConfig) -> Trainer:
     t = np.arange(float(IMAGES))
     if pose == "table":
         field, rates = fields.table(t), Rate(1e-3, 1e-5)

@@ -154,6 +154,7 @@ def test_formats_without_stamps_need_a_rate(tmp_path):
 
 
 @pytest.mark.data
+@pytest.mark.slow
 def test_real_motion_is_carried_to_millimetres(data_dir):
     file = data_dir / "trajectories" / "tum_vi" / "dataset-room1_512_16.csv"
     result = fit.run(Config(file, posenet_octaves=(), bspline_hz=(10.0,), steps=500))

@@ -169,6 +169,7 @@ def test_a_second_of_real_gyro_ends_at_the_truth(real):
 
 
 @pytest.mark.data
+@pytest.mark.slow
 def test_a_field_fitted_to_real_poses_moves_as_the_imu_says(real):
     """Over all 39 s. Rotor vibration is in the readings, hence raw residuals far above the data sheet."""
     imu, times, poses = real

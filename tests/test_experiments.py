@@ -27,7 +27,7 @@ FRAMES = 8
 PICTURES = {"trajectory.png", "errors.png", "renders.png"}
 FILES = PICTURES | {
     "config.json", "results.json", "trajectory.txt", "reference.txt", "field.npz", "camera.json",
-    "mesh.ply", "points.ply", "preview.png", "settings.json",
+    "map.npz", "mesh.ply", "points.ply", "preview.png", "settings.json",
 }  # fmt: skip
 
 
@@ -154,7 +154,7 @@ def test_compare_runs_every_mode(finished, tmp_path, monkeypatch, recording):
         poses = io.read_tum(finished.folder / "trajectory.txt").T
         return slam_run.SlamResult(
             poses, *np.zeros((2, FRAMES), bool), np.ones(FRAMES, bool), np.ones(FRAMES, int),
-            *np.ones((3, FRAMES)), np.ones((FRAMES, 2)), np.ones(FRAMES), *[None] * 3,
+            *np.ones((3, FRAMES)), np.ones((FRAMES, 2)), np.ones(FRAMES), None, None, (np.zeros(1),),
             np.zeros(0, int), field, params, 0.0, 0.0,
         )  # fmt: skip
 
@@ -162,6 +162,7 @@ def test_compare_runs_every_mode(finished, tmp_path, monkeypatch, recording):
     monkeypatch.setattr(slam_run, "inertial", lambda *args: None)
     monkeypatch.setattr(slam_run, "_draw", lambda *args: None)
     monkeypatch.setattr(slam_run, "_write_surface", lambda *args: ())
+    monkeypatch.setattr(slam_run, "write_map", lambda *args: None)
     monkeypatch.setattr(slam_run, "renderer", lambda *args: None)
     monkeypatch.setattr(slam_run, "map_quality", lambda *args: {"mapped": None, "held_out": None})
     outcome = imu_slam.run(imu_slam.Config(smoke=True, compare=True, out=tmp_path / "all"))

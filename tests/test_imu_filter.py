@@ -205,7 +205,9 @@ def real(folder, every):
 
 
 @pytest.mark.data
-@pytest.mark.parametrize("name, every", [("euroc_V1_02_medium", 10), ("euroc_V1_01_easy", 1)])
+@pytest.mark.parametrize(
+    "name, every", [("euroc_V1_02_medium", 10), pytest.param("euroc_V1_01_easy", 1, marks=pytest.mark.slow)]
+)
 def test_real_recordings(data_dir, name, every):
     """Consistent innovations over the run, and the bias of the truth file; see the top of this file."""
     run, true = real(data_dir / name, every)

@@ -1,5 +1,7 @@
 """Mapping a wall: fused against closed form and numpy, the gradient's map against the fused one."""
 
+from functools import partial
+
 import chex
 import jax
 import jax.numpy as jnp
@@ -8,7 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from jaxpose.camera import Camera
 from jaxpose.scenes import GridConfig, grid, merge, node_positions
-from jaxpose.slam.mapping import MapConfig, make_descend, make_fuse
+from jaxpose.slam.mapping import MapConfig, look_up, make_descend, make_fuse
 from jaxpose.slam.observe import Image, SampleConfig
 
 CAMERA = Camera(60.0, 60.0, 31.5, 23.5, 64, 48)
@@ -59,7 +61,7 @@ def test_a_wall_seen_from_several_places_is_exact():
     assert_allclose(values[surface, 1:], 100 / 255, atol=1e-6)
     # What lies behind it was not seen.
     assert_allclose(values[distance < -BAND - 1e-4, 0], BAND, rtol=1e-6)
-    assert_array_equal(np.asarray(state.memory)[distance < -BAND - 1e-4], 0)
+    assert_array_equal(np.asarray(state.memory)[distance < -BAND - 1e-4, :2], 0)
 
 
 def test_two_observations_are_weighted_as_numpy_does():
@@ -74,6 +76,23 @@ def test_two_observations_are_weighted_as_numpy_does():
     assert near.sum() > 200
     assert_allclose(values[near, 0], distance[near] + np.average(errors, weights=weights), atol=3e-6)
     assert_allclose(values[near, 1], np.average(greys, weights=weights) / 255, atol=3e-6)
+
+
+def test_the_wide_distance_reaches_farther_and_knows_where_it_was_measured():
+    """Closed form: a wall's distance, 8 voxels to both sides and no farther."""
+    state = fuse([wall_image(s) for s in SHIFTS], SHIFTS)
+    look = jax.jit(jax.vmap(partial(look_up, grid(CONFIG), CONFIG, True, state.params, state.memory)))
+    rng = np.random.default_rng(0)
+    points = np.stack([*rng.uniform(-0.1, 0.1, (2, 400)), rng.uniform(1.25, 2.35, 400)], axis=1)
+    near, distance = look(jnp.asarray(points, jnp.float32)), WALL_Z - points[:, 2]
+    within, beyond = np.abs(distance) < 0.34, np.abs(distance) > 0.41
+    assert (
+        within.sum() > 200 and (beyond & (distance < 0)).sum() > 20 and (beyond & (distance > 0)).sum() > 20
+    )
+    assert_array_equal(near.known[within], 1)
+    assert_array_equal(near.known[beyond], 0)
+    assert_allclose(near.distance[within], distance[within], atol=3e-6)
+    assert_allclose(near.rgb[np.abs(distance) < 0.1], 100 / 255, atol=1e-6)
 
 
 def test_pixels_without_depth_change_nothing():

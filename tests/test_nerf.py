@@ -11,8 +11,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from jaxpose import fields, metrics, nerf, scenes, se3
 from jaxpose.camera import Camera
-from jaxpose.nerf import Depths, Rate, TrainConfig, Views
+from jaxpose.nerf import Depths, TrainConfig, Views
 from jaxpose.scenes import NerfConfig
+from jaxpose.train import Rate
 
 CAMERA = Camera(20.0, 22.0, 7.5, 5.5, 16, 12)
 DEPTHS = Depths(1.0, 5.0)

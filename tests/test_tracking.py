@@ -12,8 +12,9 @@ from jaxpose.errors import DataError
 from jaxpose.fields import PoseNetConfig, pin
 from jaxpose.imu import Imu
 from jaxpose.recording import Frame, Recording
-from jaxpose.slam.align import align, best_start, starts
+from jaxpose.slam.align import align, best_start, starts, surface_residuals
 from jaxpose.slam.frames import gauge, make_field
+from jaxpose.slam.mapping import Nearby
 from jaxpose.slam.objective import TrackConfig
 from jaxpose.slam.observe import Pixels
 from jaxpose.slam.predict import (
@@ -30,11 +31,16 @@ SMALL = PoseNetConfig(layers=3, width=32, activation="softplus")
 LOWER, UPPER = np.float32([-2, -1.5, -1]), np.float32([2, 1.5, 3])
 
 
-def inside_of_a_box(point, direction):
+def inside_of_a_box(point):
     """A room with three pairs of walls, coloured by place."""
-    del direction
-    distance = jnp.min(jnp.concatenate([point - LOWER, UPPER - point]))
-    return distance, 0.5 + 0.4 * jnp.sin(3 * point)
+    lower, upper = LOWER.astype(point.dtype), UPPER.astype(point.dtype)
+    distance = jnp.min(jnp.concatenate([point - lower, upper - point]))
+    return Nearby(distance, 0.5 + 0.4 * jnp.sin(3 * point), jnp.ones_like(distance))
+
+
+def one_wall(point):
+    """Only the wall ahead."""
+    return inside_of_a_box(point)._replace(distance=float(UPPER[2]) - point[2])
 
 
 def box_pixels(T_world_cam, count=300):
@@ -50,23 +56,64 @@ def box_pixels(T_world_cam, count=300):
 def test_alignment_finds_the_camera_in_a_closed_form_room():
     truth = np.asarray(se3.exp(jnp.array([0.1, -0.2, 0.3, 0.2, 0.1, -0.1])))
     start = se3.compose(jnp.asarray(truth), se3.exp(jnp.array([0.08, -0.06, 0.05, 0.05, -0.04, 0.06])))
-    pixels, config, far = box_pixels(truth), TrackConfig(), jnp.float32(6)
+    pixels, config = box_pixels(truth), TrackConfig()
     wide = jnp.array([0.5, 0.5])
-    found = jax.jit(lambda T: align(inside_of_a_box, T, T, wide, pixels, far, config))(start)
+    found = jax.jit(lambda T: align(inside_of_a_box, T, T, wide, pixels, config))(start)
     error = se3.log(se3.compose(se3.inverse(found.T_world_cam), jnp.asarray(truth)))
-    assert jnp.linalg.norm(error[:3]) < 2e-3 and jnp.linalg.norm(error[3:]) < 2e-3
+    assert jnp.linalg.norm(error[:3]) < 2e-4 and jnp.linalg.norm(error[3:]) < 2e-4
     assert found.iterations < config.iterations
     # The information is that of a minimum: positive definite.
     assert jnp.linalg.eigvalsh(found.information)[0] > 0
+
+
+def test_slopes_of_the_residuals_are_those_of_finite_differences():
+    """On a map whose distance is not of slope 1, which is set right, and against moved poses."""
+    T = se3.exp(jnp.array([0.1, -0.2, 0.3, 0.2, 0.1, -0.1]))
+    pixels = box_pixels(np.asarray(T))
+    twice = lambda point: (near := inside_of_a_box(point))._replace(distance=2 * near.distance)
+    with jax.enable_x64(True):
+        T, pixels = jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), (T, pixels))
+        T = se3.compose(T, se3.exp(jnp.array([0.02, 0.03, -0.01, 0.01, -0.02, 0.01])))
+        at = jax.jit(lambda xi: surface_residuals(twice, se3.compose(T, se3.exp(xi)), pixels, TrackConfig()))
+        (found, by), steps = at(jnp.zeros(6)), 1e-6 * jnp.eye(6)
+        plain = jax.jit(lambda: surface_residuals(inside_of_a_box, T, pixels, TrackConfig())[0])()
+        np.testing.assert_allclose(found.depth, plain.depth, atol=1e-9)
+        change = [jax.tree.map(lambda a, b: (a - b) / 2e-6, at(h)[0], at(-h)[0]) for h in steps]
+        np.testing.assert_allclose(by.depth, np.stack([c.depth for c in change], -1), rtol=1e-5, atol=1e-4)
+        # The spread that colour is counted in is no part of its slope.
+        spread = np.median(np.abs(found.colour).mean(-1))
+        assert spread == pytest.approx(1, abs=0.02)
+        fixed = lambda xi: (
+            jax.vmap(twice)(
+                se3.apply(se3.compose(T, se3.exp(xi)), pixels.direction_cam * pixels.depth[:, None])
+            ).rgb
+        )
+        scale = np.median(found.colour / (fixed(jnp.zeros(6)) - pixels.rgb))
+        slope = scale * np.stack([(fixed(h) - fixed(-h)) / 2e-6 for h in steps], -1)
+        np.testing.assert_allclose(by.colour, slope, rtol=1e-5, atol=1e-4)
+
+
+def test_colour_finds_what_a_single_wall_does_not_say():
+    truth = np.eye(4)
+    start = se3.exp(jnp.array([0.03, -0.02, 0.02, 0.01, 0.0, 0.02]))
+    pixels = box_pixels(truth)
+    ahead = jnp.abs(pixels.depth - UPPER[2]) < 1e-3
+    pixels = jax.tree.map(lambda x: x[ahead], pixels)
+    found = {
+        weight: align(
+            one_wall, start, start, jnp.array([0.5, 0.5]), pixels, TrackConfig(colour_weight=weight)
+        ).T_world_cam
+        for weight in (0.0, 0.1)
+    }
+    assert jnp.linalg.norm(found[0.0][:2, 3]) > 0.02  # it slides
+    assert jnp.linalg.norm(found[0.1][:3, 3]) < 2e-3
 
 
 def test_a_sharp_prediction_holds_the_pose_against_the_image():
     truth = np.eye(4)
     start = se3.exp(jnp.array([0.03, 0.0, 0.0, 0.0, 0.0, 0.0]))
     sharp = jnp.array([1e-6, 1e-6])
-    run_align = jax.jit(
-        lambda T: align(inside_of_a_box, T, T, sharp, box_pixels(truth), jnp.float32(6), TrackConfig())
-    )
+    run_align = jax.jit(lambda T: align(inside_of_a_box, T, T, sharp, box_pixels(truth), TrackConfig()))
     assert jnp.abs(run_align(start).T_world_cam - start).max() < 1e-4
 
 
@@ -75,7 +122,7 @@ def test_the_best_start_is_the_one_that_explains_the_image():
     tries = starts(jnp.asarray(truth), jnp.array([0.1, 0.1]))
     assert tries.shape == (13, 4, 4)
     order = jnp.roll(tries, 5, axis=0)
-    chosen = best_start(inside_of_a_box, order, box_pixels(truth), jnp.float32(6), TrackConfig())
+    chosen = best_start(inside_of_a_box, order, box_pixels(truth))
     assert jnp.array_equal(chosen, jnp.asarray(truth))
 
 

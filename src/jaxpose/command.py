@@ -2,6 +2,7 @@
 
 import io
 import json
+import math
 import os
 import re
 import sys
@@ -43,6 +44,22 @@ def parse(
         sys.exit(f"{name}: {_one_line(complaint.getvalue())}")
     except ValueError as error:  # a config that does not allow its values
         sys.exit(f"{name}: {error}")
+
+
+def check_least(config: Any, **least: int | float) -> None:
+    """ValueError for an option (or an entry of one) below its least value, infinite or NaN; None is free."""
+    for name, smallest in least.items():
+        values = getattr(config, name)
+        for value in values if isinstance(values, tuple) else (values,):
+            if value is not None and not smallest <= value < math.inf:
+                option = name.replace("_", "-")
+                raise ValueError(f"--{option}: expected at least {smallest}, got {value}")
+
+
+def check_resume(config: Any) -> None:
+    """ValueError for `resume` without the folder of the run to go on with."""
+    if config.resume and config.out is None and config.name is None:
+        raise ValueError("--resume: expected --out DIR or --name NAME with it")
 
 
 def guarded(name: str, action: Callable[[], str]) -> None:
@@ -117,6 +134,11 @@ def markdown_table(rows: Sequence[Sequence[str]]) -> str:
     ]
     lines.insert(1, "|" + "|".join("-" * (width + 2) for width in widths) + "|")
     return "\n".join(lines)
+
+
+def number(value: float | None, digits: int) -> str:
+    """A cell of a table; n/a where there is nothing to tell."""
+    return "n/a" if value is None else f"{value:.{digits}f}"
 
 
 def _one_line(boxed: str) -> str:

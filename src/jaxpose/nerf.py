@@ -12,23 +12,12 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt8
 
 from jaxpose import render, se3
 from jaxpose.camera import Camera, pixel_direction
-from jaxpose.fields import PoseField, set_progress
+from jaxpose.fields import PoseField
 from jaxpose.render import Ray, Spacing
 from jaxpose.scenes import SceneField
-from jaxpose.train import sum_by_chunks
+from jaxpose.train import Trainer, joint, sum_by_chunks
 
 Params = Any
-
-
-class Rate(NamedTuple):
-    """Adam's learning rate over the training: exponential from `first` to `last`, zero before `start`.
-
-    `start` is a share of the training. All three may be arrays that broadcast against the parameters.
-    """
-
-    first: Any
-    last: Any
-    start: Any = 0.0
 
 
 @dataclass(frozen=True)
@@ -60,24 +49,6 @@ class Views(NamedTuple):
     rgb: UInt8[Array, "n h w 3"]
 
 
-class State(NamedTuple):
-    """All that a training goes on from."""
-
-    scene: Params
-    pose: Params
-    adam: Any
-    key: PRNGKeyArray
-    step: Int[Array, ""]
-
-
-class Trainer(NamedTuple):
-    """Compiled functions for one scene, pose field, camera and number of images."""
-
-    start: Callable[[PRNGKeyArray], State]
-    # Some steps (static), and the loss of each: the mean squared colour error.
-    advance: Callable[[State, Views, int], tuple[State, Float[Array, " k"]]]
-
-
 def trainer(
     scene: SceneField,
     field: PoseField,
@@ -89,52 +60,32 @@ def trainer(
 ) -> Trainer:
     """Adam on the mean squared colour error of random rays, jointly over scene and poses.
 
-    `field.pose` is camera-to-world; `scene` has a volume density. The rates are trees of `Rate`, each a
-    prefix of its parameters. Coarse-to-fine windows of scene and field follow the steps. Samples are drawn
-    anew for every ray. Rays that end nowhere are as in BARF: the last sample closes them.
+    `field.pose` is camera-to-world; `scene` has a volume density; the rates are as in `train.joint`. Samples
+    are drawn anew for every ray. Rays that end nowhere are as in BARF: the last sample closes them.
     """
-    adam = optax.scale_by_adam()
-
-    def start(key):
-        scene_key, pose_key, key = jax.random.split(key, 3)
-        first = scene.init(scene_key), field.init(pose_key)
-        return State(*first, adam.init(first), key, jnp.zeros((), jnp.int32))
 
     def error(scene_params, item):
         ray, depth, rgb = item
-        return jnp.sum((_colour(scene, scene_params, ray, depth)[0] - rgb) ** 2)
+        return jnp.sum((ray_colour(scene, scene_params, ray, depth)[0] - rgb) ** 2)
 
     total = sum_by_chunks(error, min(config.chunk, config.rays))
 
-    def loss(params, views, key):
+    def loss(scene_params, pose_params, views, key):
         view_key, pixel_key, depth_key = jax.random.split(key, 3)
         count, height, width, _ = views.rgb.shape
         view = jax.random.randint(view_key, (config.rays,), 0, count)
         x, y = _pixels(pixel_key, config.rays, height, width)
-        scene_params, pose_params = params
         # Once for every image, not for every ray.
         T_world_cam = jax.vmap(field.pose, (None, 0))(pose_params, views.t)[view]
-        rays = jax.vmap(partial(_ray, camera))(T_world_cam, x, y)
-        batch = rays, _depths(depth_key, depths, config), _unit(views.rgb[view, y, x])
+        rays = jax.vmap(partial(pixel_ray, camera))(T_world_cam, x, y)
+        batch = (
+            rays,
+            draw_depths(depth_key, depths, rays=config.rays, samples=config.samples),
+            _unit(views.rgb[view, y, x]),
+        )
         return total(scene_params, batch) / (3 * config.rays)
 
-    def step(state, _, views):
-        key, loss_key = jax.random.split(state.key)
-        progress = state.step.astype(jnp.zeros(()).dtype) / config.steps
-        params = _at(state.scene, progress), _at(state.pose, progress)
-        value, gradient = jax.value_and_grad(loss)(params, views, loss_key)
-        with jax.numpy_dtype_promotion("standard"):  # optax needs it
-            direction, memory = adam.update(gradient, state.adam)
-        rates = scene_rates, pose_rates
-        moves = jax.tree.map(lambda rate: _rate(rate, progress), rates, is_leaf=_is_rate)
-        moves = jax.tree.broadcast(moves, params)
-        scene_params, pose_params = jax.tree.map(lambda p, rate, d: p - rate * d, params, moves, direction)
-        return State(scene_params, pose_params, memory, key, state.step + 1), value
-
-    def advance(state, views, count):
-        return jax.lax.scan(partial(step, views=views), state, length=count)
-
-    return Trainer(jax.jit(start), jax.jit(advance, static_argnums=2))
+    return joint(loss, scene.init, field.init, scene_rates, pose_rates, config.steps)
 
 
 class Viewer(NamedTuple):
@@ -152,6 +103,7 @@ def viewer(
     depths: Depths,
     config: TrainConfig = TrainConfig(),  # noqa: B008 - frozen
     *,
+    background: float | None = None,
     settle_steps: int = 100,
     settle_rate: float = 1e-3,
 ) -> Viewer:
@@ -164,14 +116,16 @@ def viewer(
     def image(scene_params, T_world_cam):
         y, x = jnp.mgrid[: camera.height, : camera.width]
         depth = render.sample_depths(None, depths.near, depths.far, config.samples, spacing=depths.spacing)
-        one = lambda xy: _colour(scene, scene_params, _ray(camera, T_world_cam, *xy), depth)
+        one = lambda xy: ray_colour(
+            scene, scene_params, pixel_ray(camera, T_world_cam, *xy), depth, background
+        )
         rgb, found = jax.lax.map(one, (x.ravel(), y.ravel()), batch_size=config.chunk)
         return rgb.reshape(*x.shape, 3), found.reshape(x.shape)
 
     def settle(scene_params, T_world_cam, rgb, key):
         def error(_, item):
             ray, depth, seen = item
-            return jnp.sum((_colour(scene, scene_params, ray, depth)[0] - seen) ** 2)
+            return jnp.sum((ray_colour(scene, scene_params, ray, depth, background)[0] - seen) ** 2)
 
         total = sum_by_chunks(error, min(config.chunk, config.rays))
 
@@ -179,8 +133,12 @@ def viewer(
             pixel_key, depth_key = jax.random.split(key)
             x, y = _pixels(pixel_key, config.rays, *rgb.shape[:2])
             moved = se3.compose(se3.exp(twist), T_world_cam)
-            rays = jax.vmap(partial(_ray, camera, moved))(x, y)
-            batch = rays, _depths(depth_key, depths, config), _unit(rgb[y, x])
+            rays = jax.vmap(partial(pixel_ray, camera, moved))(x, y)
+            batch = (
+                rays,
+                draw_depths(depth_key, depths, rays=config.rays, samples=config.samples),
+                _unit(rgb[y, x]),
+            )
             return total((), batch) / (3 * config.rays)
 
         def step(carry, key):
@@ -197,16 +155,32 @@ def viewer(
     return Viewer(jax.jit(image), jax.jit(settle))
 
 
-def _colour(
-    scene: SceneField, scene_params: Params, ray: Ray, depth: Float[Array, " s"]
+def ray_colour(
+    scene: SceneField,
+    scene_params: Params,
+    ray: Ray,
+    depth: Float[Array, " s"],
+    background: float | None = None,
 ) -> tuple[Float[Array, "3"], Float[Array, ""]]:
-    """Colour and expected depth along one ray whose direction has length 1 along the optical axis."""
-    weights = partial(render.density_weights, length=jnp.linalg.norm(ray.direction))
+    """Colour and expected depth along one ray whose direction has length 1 along the optical axis.
+
+    Without a `background` the last sample closes the ray, as in BARF; with one, what passes the last sample
+    but one shows it, and the depth is that of the rest.
+    """
+
+    def weights(density, depth):
+        length = jnp.linalg.norm(ray.direction)
+        ends = render.density_weights(density, depth, length=length)
+        return ends if background is None else ends.at[-1].set(0)
+
     rendered = render.render_ray(partial(scene.query, scene_params), ray, depth, weights=weights)
-    return rendered.rgb, rendered.depth
+    if background is None:
+        return rendered.rgb, rendered.depth
+    return rendered.opacity * rendered.rgb + (1 - rendered.opacity) * background, rendered.depth
 
 
-def _ray(camera: Camera, T_world_cam: Float[Array, "4 4"], x: Int[Array, ""], y: Int[Array, ""]) -> Ray:
+def pixel_ray(camera: Camera, T_world_cam: Float[Array, "4 4"], x: Int[Array, ""], y: Int[Array, ""]) -> Ray:
+    """The ray through a pixel, its direction of length 1 along the optical axis."""
     pixel = jnp.stack([x, y]).astype(T_world_cam.dtype)
     direction = jnp.matmul(T_world_cam[:3, :3], pixel_direction(camera, pixel), precision="highest")
     return Ray(T_world_cam[:3, 3], direction)
@@ -220,29 +194,14 @@ def _pixels(
     return pixel % width, pixel // width
 
 
-def _depths(key: PRNGKeyArray, depths: Depths, config: TrainConfig) -> Float[Array, "r s"]:
-    draw = lambda key: render.sample_depths(
-        key, depths.near, depths.far, config.samples, spacing=depths.spacing
-    )
-    return jax.vmap(draw)(jax.random.split(key, config.rays))
+def draw_depths(
+    key: PRNGKeyArray, depths: Depths, *, rays: int, samples: int
+) -> Float[Array, "rays samples"]:
+    """Increasing depths for each of so many rays, drawn as `render.sample_depths` does."""
+    draw = lambda key: render.sample_depths(key, depths.near, depths.far, samples, spacing=depths.spacing)
+    return jax.vmap(draw)(jax.random.split(key, rays))
 
 
 def _unit(rgb: UInt8[Array, "*n 3"]) -> Float[Array, "*n 3"]:
     """Colours from 0 to 1."""
     return rgb.astype(jnp.zeros(()).dtype) / 255
-
-
-def _at(params: Params, progress: Float[Array, ""]) -> Params:
-    """Parameters whose coarse-to-fine window, if they have one, is where the training is."""
-    has_window = isinstance(params, dict) and "progress" in params
-    return set_progress(params, progress) if has_window else params
-
-
-def _is_rate(x: Any) -> bool:
-    return isinstance(x, Rate)
-
-
-def _rate(rate: Rate, progress: Float[Array, ""]) -> Float[Array, "*n"]:
-    first, last, start = (jnp.asarray(x, progress.dtype) for x in rate)
-    # Not first (last / first)^progress: a rate of zero keeps its parameters at rest.
-    return jnp.where(progress >= start, first ** (1 - progress) * last**progress, 0)

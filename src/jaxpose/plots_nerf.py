@@ -21,7 +21,6 @@ _MOST_FRUSTA = 30
 _PATH_STEP = 0.4  # from view to view, in extents; cameras that jump farther are on no path
 _WORST = 0.3  # colour difference at the end of its scale
 _RUNS = (ESTIMATE, LOST, SENSOR, "#5b8c5a", "#7d5ba6", "#3d3d3d")
-_HELD_OUT_TITLES = ("held-out photograph", "render", "depth", "colour difference")
 
 
 class HeldOut(NamedTuple):
@@ -93,7 +92,9 @@ def cameras(
         _save(figure, path)
 
 
-def held_out(path: Path | str, views: Sequence[HeldOut], title: str) -> None:
+def held_out(
+    path: Path | str, views: Sequence[HeldOut], title: str, *, photograph: str = "held-out photograph"
+) -> None:
     """Photograph, render, depth and colour difference side by side, one row a view, at most four."""
     views = views[:4]
     depths = np.concatenate([view.rendered_depth.ravel() for view in views])
@@ -110,7 +111,7 @@ def held_out(path: Path | str, views: Sequence[HeldOut], title: str) -> None:
         shades: list[Any] = []
         for number, view in enumerate(views):
             row = [figure.add_subplot(cells[number, k]) for k in range(4)]
-            for axes, name in zip(row, _HELD_OUT_TITLES, strict=True):
+            for axes, name in zip(row, (photograph, "render", "depth", "colour difference"), strict=True):
                 axes.set(xticks=[], yticks=[], title=name if number == 0 else None)
                 axes.grid(False)
                 axes.spines[:].set_visible(False)

@@ -1,14 +1,86 @@
-"""Training: sums over many items whose gradient takes the memory of a few."""
+"""Joint training of a scene and a pose field, and sums over many items in the memory of a few."""
 
 from collections.abc import Callable
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import optax
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from jaxpose.fields import set_progress
 
 Params = Any
 Batch = Any
+
+
+class Rate(NamedTuple):
+    """Adam's learning rate over the training: exponential from `first` to `last`, zero before `start`.
+
+    `start` is a share of the training. All three may be arrays that broadcast against the parameters.
+    """
+
+    first: Any
+    last: Any
+    start: Any = 0.0
+
+
+class State(NamedTuple):
+    """All that a training goes on from."""
+
+    scene: Params
+    pose: Params
+    adam: Any
+    key: PRNGKeyArray
+    step: Int[Array, ""]
+
+
+class Trainer(NamedTuple):
+    """Compiled functions of one training."""
+
+    start: Callable[[PRNGKeyArray], State]
+    # Some steps (static) on the data, and the loss of each.
+    advance: Callable[[State, Batch, int], tuple[State, Float[Array, " k"]]]
+
+
+def joint(
+    loss: Callable[[Params, Params, Batch, PRNGKeyArray], Float[Array, ""]],
+    init_scene: Callable[[PRNGKeyArray], Params],
+    init_pose: Callable[[PRNGKeyArray], Params],
+    scene_rates: Any,
+    pose_rates: Any,
+    steps: int,
+) -> Trainer:
+    """Adam on `loss(scene, pose, data, key)`, jointly over the parameters of scene and poses.
+
+    The rates are trees of `Rate`, each a prefix of its parameters. Coarse-to-fine windows of scene and field
+    follow the steps.
+    """
+    adam = optax.scale_by_adam()
+
+    def start(key):
+        scene_key, pose_key, key = jax.random.split(key, 3)
+        first = init_scene(scene_key), init_pose(pose_key)
+        return State(*first, adam.init(first), key, jnp.zeros((), jnp.int32))
+
+    def step(state, _, data):
+        key, loss_key = jax.random.split(state.key)
+        progress = state.step.astype(jnp.zeros(()).dtype) / steps
+        params = _at(state.scene, progress), _at(state.pose, progress)
+        value, gradient = jax.value_and_grad(lambda both: loss(both[0], both[1], data, loss_key))(params)
+        with jax.numpy_dtype_promotion("standard"):  # optax needs it
+            direction, memory = adam.update(gradient, state.adam)
+        rates = scene_rates, pose_rates
+        moves = jax.tree.map(lambda rate: _rate(rate, progress), rates, is_leaf=_is_rate)
+        moves = jax.tree.broadcast(moves, params)
+        scene_params, pose_params = jax.tree.map(lambda p, rate, d: p - rate * d, params, moves, direction)
+        return State(scene_params, pose_params, memory, key, state.step + 1), value
+
+    def advance(state, data, count):
+        return jax.lax.scan(partial(step, data=data), state, length=count)
+
+    return Trainer(jax.jit(start), jax.jit(advance, static_argnums=2))
 
 
 def sum_by_chunks(
@@ -84,3 +156,19 @@ def _over_chunks(function: Callable[[Batch], tuple[Any, Any]], batch: Batch, chu
     return jax.tree.map(lambda *x: sum(x[1:], x[0]), *sums), jax.tree.map(
         lambda *x: jnp.concatenate(x), *joined
     )
+
+
+def _at(params: Params, progress: Float[Array, ""]) -> Params:
+    """Parameters whose coarse-to-fine window, if they have one, is where the training is."""
+    has_window = isinstance(params, dict) and "progress" in params
+    return set_progress(params, progress) if has_window else params
+
+
+def _is_rate(x: Any) -> bool:
+    return isinstance(x, Rate)
+
+
+def _rate(rate: Rate, progress: Float[Array, ""]) -> Float[Array, "*n"]:
+    first, last, start = (jnp.asarray(x, progress.dtype) for x in rate)
+    # Not first (last / first)^progress: a rate of zero keeps its parameters at rest.
+    return jnp.where(progress >= start, first ** (1 - progress) * last**progress, 0)

@@ -1,9 +1,9 @@
 """What a set of data is, and what is wrong with it: stamps, poses, camera, depth, IMU, and how they agree.
 
 DATA is a folder of an RGB-D recording (7-Scenes, TUM, Replica, ScanNet, EuRoC, plain), of photographs with
-poses (Blender, nerfstudio, LLFF), of an IMU with truth (EuRoC), or of events (DAVIS); a trajectory file (TUM,
-KITTI, EuRoC, 4x4), or a folder of such files. The format is found by the files. Ends with 0 if no fault is
-found, with 2 for warnings, and with 1 for data that cannot be used.
+poses (Blender, nerfstudio, LLFF), of an IMU with truth (EuRoC), or of events (DAVIS text, EventNeRF, npz,
+DSEC's HDF5); a trajectory file (TUM, KITTI, EuRoC, 4x4), or a folder of such files. The format is found by
+the files. Ends with 0 if no fault is found, with 2 for warnings, and with 1 for data that cannot be used.
 """
 
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from jaxpose.errors import DataError
 _KNOWN = (
     "an RGB-D recording (7-Scenes, TUM, Replica, ScanNet, EuRoC, or color/ and depth/ with intrinsics), "
     "photographs (transforms.json, transforms_train.json or poses_bounds.npy), mav0/imu0 with truth, "
-    "events*.txt, or trajectories"
+    "events (events*.txt, *.npz, *.h5, or EventNeRF's folders), or trajectories"
 )
 
 
@@ -43,7 +43,7 @@ class Result(NamedTuple):
 def run(config: Config) -> Result:
     """Find the format of the data and test them; DataError or OSError for what has no format known here."""
     path = config.data
-    if path.is_file() and path.suffix != ".json":
+    if path.is_file() and path.suffix not in (".json", ".npz", ".h5", ".hdf5"):
         from jaxpose.commands.check_trajectory import check_trajectory
 
         form, checked = check_trajectory(path)
@@ -90,8 +90,8 @@ def _folder(path: Path) -> tuple[str, Checked]:
 
     transforms = [path, path / "transforms_train.json", path / "transforms.json"]
     file = next((file for file in transforms if file.is_file()), None)
-    if path.is_dir() and (events := check_events.event_files(path)):
-        return f"DAVIS events ({events[0].name})", check_events.check_events(path)
+    if events := check_events.find_events(path):
+        return check_events.check_events(path, events)
     if file is not None and not (path / "color").is_dir():
         name = "Blender" if file.name == "transforms_train.json" else "nerfstudio, instant-ngp"
         return f"photographs, {name} ({file.name})", check_photographs.check_photographs(path, "blender")

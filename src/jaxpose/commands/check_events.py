@@ -1,86 +1,94 @@
-"""Checks of the event camera data set's layout: events, frames, calibration, truth."""
+"""Checks of event recordings: the events, camera, frames and poses, as far as they are there."""
 
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
 
 from jaxpose.commands.check_findings import Checked, Fact, Finding, join, unusable
+from jaxpose.commands.check_poses import check_poses
 from jaxpose.commands.check_recording import check_camera
 from jaxpose.commands.check_stamps import check_stamps, read_table
 from jaxpose.commands.check_trajectory import check_trajectory
-from jaxpose.data.images import SUFFIXES, image_size
+from jaxpose.data import event_recordings
+from jaxpose.data.event_stream import Stream, Tally, count, listed, reach
 from jaxpose.errors import DataError
+from jaxpose.recording import EventRecording
 
-_MOST = 500_000  # events that are read: recordings have hundreds of millions
-_SENSOR = (240, 180)  # of the data set's DAVIS240C
-
-
-def event_files(folder: Path) -> list[Path]:
-    """Files of events in a folder."""
-    return sorted(folder.glob("events*.txt"))
+_MOST = 500_000  # events that are looked at: recordings have hundreds of millions
+_RATES_HZ = (1e2, 1e9)
+_NAMES = {"eventnerf": "EventNeRF", "davis": "DAVIS", "hdf5": "HDF5", "npz": "npz"}
 
 
-def check_events(folder: Path) -> Checked:
-    """Events of the first file, frames, calibration and truth, as far as they are there."""
-    images = sorted(file for file in folder.glob("images/*") if file.suffix in SUFFIXES)
-    parts = []
+def find_events(path: Path) -> event_recordings.Format | None:
+    """The layout of the events that a folder or file has; None if it has none."""
     try:
-        size = image_size(images[0]) if images else _SENSOR
-        parts.append(_events(event_files(folder)[0], size))
-        if (folder / "calib.txt").is_file():
-            parts.append(_calibration(folder / "calib.txt", size))
-        if (folder / "images.txt").is_file():
-            table = read_table(folder / "images.txt")
-            parts.append(check_stamps("images.txt", table[:, 0], gaps="warning"))
-        if (folder / "groundtruth.txt").is_file():
-            checked = check_trajectory(folder / "groundtruth.txt")[1]
-            parts.append(
-                checked._replace(facts=tuple(f._replace(name=f"truth {f.name}") for f in checked.facts))
-            )
+        return event_recordings.find_format(path)
+    except DataError:
+        return None
+
+
+def check_events(path: Path, form: event_recordings.Format) -> tuple[str, Checked]:
+    """The format in words, and what is tested of it, of events only the first."""
+    parts, name = [], f"{_NAMES[form]} events"
+    try:
+        stream, camera, _ = event_recordings.find(path, form)
+        name = f"{name} ({stream.file.name})"
+        size = (camera.width, camera.height)
+        tally = count(stream, size, most=_MOST)
+        parts += [_events(stream, tally, size), check_camera(camera), *_beside(stream.file.parent)]
+        # EventNeRF's views are spread over all events, so there all are read.
+        span = None if form == "eventnerf" else (tally.earliest, np.nextafter(tally.latest, np.inf))
+        parts.append(_recording(event_recordings.load(path, form, span=span), form))
     except (DataError, OSError) as error:
         parts.append(unusable(error))
-    return join(parts)
+    return name, join(parts)
 
 
-def _events(file: Path, size: tuple[int, int]) -> Checked:
-    """Count, rate, polarities and pixels of the first events."""
-    with file.open() as lines:
-        table = np.array([line.split() for line in islice(lines, _MOST)])
-    try:
-        t, x, y, polarity = table.astype(np.float64).T
-    except ValueError:
-        raise DataError(f"{file}: expected lines of t x y p, got others") from None
-    span = float(np.ptp(t))
-    values = sorted({float(p) for p in polarity})
-    kept = "the first " if len(t) == _MOST else ""
-    text = f"{kept}{len(t)} in {span:.4g} s ({len(t) / max(span, 1e-12):.3g} Hz), polarities "
-    text += (
-        f"{' and '.join(f'{p:g}' for p in values)}, pixels to {x.max():g}, {y.max():g} of {size[0]}x{size[1]}"
-    )
-    fact = Fact("events", text, {"count": len(t), "span_s": span, "rate_hz": len(t) / max(span, 1e-12)})
+def _events(stream: Stream, tally: Tally, size: tuple[int, int]) -> Checked:
+    """Count, rate, polarities and pixels of the first events; what loading refuses is not told here."""
+    span = tally.latest - tally.earliest
+    rate = tally.count / max(span, 1e-12)
+    kept = "the first " if tally.count >= _MOST else ""
+    text = f"{kept}{tally.count} in {span:.4g} s ({rate:.3g} Hz), polarities {listed(tally.polarities)}, "
+    text += f"pixels {reach(tally)} of {size[0]}x{size[1]}"
+    fact = Fact("events", text, {"count": tally.count, "span_s": span, "rate_hz": rate})
     findings = []
-    if (np.diff(t) < 0).any():
-        row = int((np.diff(t) < 0).argmax()) + 2
-        findings.append(Finding("error", "events", f"one that goes back in line {row}", "stamps that rise"))
-    if not (0 <= x.min() and x.max() < size[0] and 0 <= y.min() and y.max() < size[1]):
+    if tally.back:
+        found = f"{tally.back} earlier than one before, by up to {tally.most_back:.3g} s, "
+        found += f"the first at {stream.where(tally.first_back or 0)}"
+        findings.append(Finding("warning", "events", found, "stamps that rise"))
+    if tally.outside:
         expected = f"pixels of {size[0]}x{size[1]}"
-        findings.append(Finding("warning", "events", f"up to {x.max():g}, {y.max():g}", expected))
-    if values not in ([0.0, 1.0], [-1.0, 1.0]):
-        found = ", ".join(f"{p:g}" for p in values[:5])
-        findings.append(Finding("warning", "events", found, "polarities 0 and 1, or -1 and 1"))
-    if span and not 1e2 < len(t) / span < 1e9:
-        found = f"{len(t) / span:.3g} Hz"
-        findings.append(Finding("warning", "unit of time", found, "100 Hz to 1 GHz of events", "stamps in s"))
+        findings.append(Finding("warning", "events", reach(tally), expected))
+    if len(tally.polarities) < 2:
+        expected = "polarities 0 and 1, or -1 and 1"
+        findings.append(Finding("warning", "events", f"only {listed(tally.polarities)}", expected))
+    if span and (tally.unit != (stream.unit or tally.unit) or not _RATES_HZ[0] < rate < _RATES_HZ[1]):
+        stated = f"100 Hz to 1 GHz of events, stamps in {stream.unit or 's, us or ns'}"
+        found = f"{rate:.3g} Hz with stamps in {tally.unit}"
+        findings.append(Finding("warning", "unit of time", found, stated))
     ok = Finding("ok", "events", "in order, within the sensor, two polarities")
     return Checked((fact,), tuple(findings) or (ok,))
 
 
-def _calibration(file: Path, size: tuple[int, int]) -> Checked:
-    from jaxpose.camera import Camera
+def _beside(folder: Path) -> list[Checked]:
+    """Stamps of frames, and true poses."""
+    parts = []
+    if (folder / "images.txt").is_file():
+        parts.append(check_stamps("images.txt", read_table(folder / "images.txt")[:, 0], gaps="warning"))
+    for file in (folder / "groundtruth.txt", folder / "poses.txt"):
+        if file.is_file():
+            checked = check_trajectory(file)[1]
+            facts = tuple(fact._replace(name=f"truth {fact.name}") for fact in checked.facts)
+            parts.append(checked._replace(facts=facts))
+    return parts
 
-    table = read_table(file)
-    if table.shape != (1, 9):
-        raise DataError(f"{file}: expected 9 numbers (fx fy cx cy k1 k2 p1 p2 k3), got {table.size}")
-    fx, fy, cx, cy, *lens = (float(number) for number in table[0])
-    return check_camera(Camera(fx, fy, cx, cy, *size, tuple(lens) if any(lens) else ()))
+
+def _recording(recording: EventRecording, form: event_recordings.Format) -> Checked:
+    """What the loader has to tell, and the views of EventNeRF, which are no trajectory file."""
+    if form != "eventnerf":
+        return Checked(notes=recording.notes)
+    held_out = 0 if recording.held_out is None else len(recording.held_out.t)
+    text = f"{len(recording.t)} in {recording.t[-1]:.4g} s, and {held_out} held out"
+    fact = Fact("views", text, {"count": len(recording.t), "held_out": held_out})
+    return join([Checked((fact,), (), recording.notes), check_poses(recording.t, recording.T_world_cam)])

@@ -15,7 +15,7 @@ import numpy as np
 import tyro
 
 from jaxpose import io, io_trajectory
-from jaxpose.commands.source import FIELD, Source, read_field, read_source
+from jaxpose.commands.source import FIELD, Source, images_on_disk, read_field, read_source
 from jaxpose.errors import DataError
 
 if TYPE_CHECKING:
@@ -152,7 +152,7 @@ def _with_images(config: Config, source: Source, trajectory: io.Trajectory) -> t
     t, T_world_cam = trajectory
     if images and len(images) != len(t):
         raise DataError(f"{source.path}: expected {len(images)} poses, one an image, got {len(t)}")
-    found, notes = _on_disk(folder, images), ()
+    found, notes = images_on_disk(folder, images), ()
     if found:
         camera, notes = _as_on_disk(camera, found[0])
         images = tuple(file.relative_to(folder).as_posix() for file in found)
@@ -172,15 +172,6 @@ def _with_images(config: Config, source: Source, trajectory: io.Trajectory) -> t
     shots = Photographs(name, camera, t, pixels, T_world_cam, np.nan, np.nan, "disparity", images)
     write_transforms(config.out, shots)
     return *notes, "axes right, up, back, as these files have them"
-
-
-def _on_disk(folder: Path, images: tuple[str, ...]) -> list[Path]:
-    """The files of the images, whose names may lack a suffix; nothing unless all are there."""
-    from jaxpose.data.images import SUFFIXES
-
-    candidates = [[folder / name, *(folder / f"{name}{suffix}" for suffix in SUFFIXES)] for name in images]
-    found = [next((file for file in files if file.is_file()), None) for files in candidates]
-    return [] if None in found else [file for file in found if file is not None]
 
 
 def _as_on_disk(camera: "Camera", file: Path) -> tuple["Camera", tuple[str, ...]]:

@@ -14,7 +14,7 @@ import numpy as np
 import tyro
 from jaxtyping import Float
 
-from jaxpose.command import markdown_table
+from jaxpose.command import check_least, markdown_table
 from jaxpose.commands.source import read_source
 from jaxpose.errors import DataError
 from jaxpose.io import Trajectory
@@ -44,16 +44,7 @@ class Config:
     def __post_init__(self):
         if not self.posenet_octaves and not self.bspline_hz:
             raise ValueError("--bspline-hz: expected a field to fit, PoseNet or B-spline, got none")
-        for option, least in (
-            ("posenet_octaves", 0),
-            ("posenet_layers", 1),
-            ("posenet_width", 1),
-            ("steps", 1),
-        ):
-            values = getattr(self, option)
-            for value in values if isinstance(values, tuple) else (values,):
-                if value < least:
-                    raise ValueError(f"--{option.replace('_', '-')}: expected at least {least}, got {value}")
+        check_least(self, posenet_octaves=0, posenet_layers=1, posenet_width=1, steps=1)
         for option in ("bspline_hz", "rate_hz"):
             values = getattr(self, option)
             for value in values if isinstance(values, tuple) else (values,):

@@ -63,6 +63,15 @@ def read_field(source: Source) -> Callable[[Float[np.ndarray, " n"]], Float[np.n
         raise DataError(f"{file}: {found} (what older runs left needs a new run)") from None
 
 
+def images_on_disk(folder: Path, names: tuple[str, ...]) -> list[Path]:
+    """The files of a run's images, whose names may lack a suffix; nothing unless all are there."""
+    from jaxpose.data.images import SUFFIXES
+
+    candidates = [[folder / name, *(folder / f"{name}{suffix}" for suffix in SUFFIXES)] for name in names]
+    found = [next((file for file in files if file.is_file()), None) for files in candidates]
+    return [] if None in found else [file for file in found if file is not None]
+
+
 def _experiment(results: Path) -> str:
     """Which experiment a run is of, where it says so: a run that goes on has no results yet."""
     if not results.is_file():

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from jaxpose.camera import Camera
 from jaxpose.data.images import SUFFIXES, image_size, natural_order
-from jaxpose.data.photographs import OPENGL, check_poses, frame_numbers, read_images
+from jaxpose.data.photographs import OPENGL, check_poses, extent_depths, frame_numbers, read_images
 from jaxpose.errors import DataError
 from jaxpose.recording import Photographs, take
 
@@ -268,9 +268,7 @@ def _depths(
         return *source.near_far, "depth", ()
     depth = _focus_depths(source.T_world_cam)
     if depth is None:
-        centres = source.T_world_cam[:, :3, 3]
-        extent = float(np.linalg.norm(centres - centres.mean(0), axis=1).max()) or 1.0
-        near, far, spacing, why = 0.1 * extent, 100 * extent, "disparity", "the cameras' extent"
+        (near, far), spacing, why = extent_depths(source.T_world_cam), "disparity", "the cameras' extent"
     elif "fl_x" not in source.intrinsics and _BLENDER[0] < depth.min() and depth.max() < _BLENDER[1]:
         return *_BLENDER, "depth", ()
     elif transparent:

@@ -19,17 +19,15 @@ from jaxpose.data.euroc_files import (
     sensors,
 )
 from jaxpose.data.images import check_depth, common_size, found, read_color, read_depth, some, usable_poses
+from jaxpose.data.truth import poses_at
 from jaxpose.errors import DataError
 from jaxpose.imu import Imu, ImuNoise
-from jaxpose.imu_simulation import interpolant
-from jaxpose.io import nearest
+from jaxpose.io import Trajectory
 from jaxpose.io_ply import read_points
 from jaxpose.recording import Frame, Recording
 
 _IMU_COLUMNS = "7 columns (stamp, 3 rates, 3 accelerations)"
 _TRUTH_COLUMNS = "17 columns (stamp, 3 position, 4 quaternion, 3 velocity, 3 gyro bias, 3 accelerometer bias)"
-_MOST_GAP_S = 0.1  # between two true poses that one is interpolated from
-_AT_A_STAMP_S = 1e-3  # so close to a true pose, no other needs to be near
 
 
 class ImuLog(NamedTuple):
@@ -153,17 +151,11 @@ def load_truth(path: Path | str) -> Truth:
 
 def _truth_at(mav0: Path, t: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarray, "n 4 4"], tuple[str, ...]]:
     """T_world_body at times on the IMU's clock, NaN where the truth has a gap; a note if there is none."""
-    poses = np.full((len(t), 4, 4), np.nan)
     if not (mav0 / "state_groundtruth_estimate0").is_dir():
-        return poses, ("no state_groundtruth_estimate0: there is no truth to compare with",)
+        none = np.full((len(t), 4, 4), np.nan)
+        return none, ("no state_groundtruth_estimate0: there is no truth to compare with",)
     truth = load_truth(mav0)
-    after = np.clip(np.searchsorted(truth.t, t), 1, max(len(truth.t) - 1, 1))
-    if len(truth.t) > 1:
-        gap = truth.t[after] - truth.t[after - 1]
-        known = (gap <= _MOST_GAP_S) | (np.abs(truth.t[nearest(t, truth.t)] - t) <= _AT_A_STAMP_S)
-        inside = (t >= truth.t[0]) & (t <= truth.t[-1]) & known
-        poses[inside] = interpolant(truth.t, truth.T_world_body).pose(t[inside])
-    return poses, ()
+    return poses_at(Trajectory(truth.t, truth.T_world_body), t), ()
 
 
 def _find_depth(mav0: Path, cam0: CameraLog, T_world_cam: Float[np.ndarray, "n 4 4"]) -> _Depth:

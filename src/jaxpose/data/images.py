@@ -218,6 +218,15 @@ def found(path: Path) -> str:
     return some(sorted(file.name for file in path.iterdir())) or "an empty folder"
 
 
+def only(candidates: Sequence[Path], path: Path, expected: str, kind: str = "files") -> Path:
+    """The one of `kind` found in `path`; DataError saying what was `expected` where there is not just one."""
+    if len(candidates) == 1:
+        return candidates[0]
+    names = some([candidate.name for candidate in candidates])
+    got = f"{len(candidates)} {kind}, name one of them: {names}" if candidates else found(path)
+    raise DataError(f"{path}: expected {expected}, got {got}")
+
+
 def name_of(folder: Path) -> str:
     """A recording's name: its folder and the one that holds it."""
     return f"{folder.resolve().parent.name}/{folder.resolve().name}"

@@ -9,7 +9,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, UInt8
+from jaxtyping import Array, Float
 
 from jaxpose.camera import Camera, pixel_direction
 from jaxpose.recording import Photographs
@@ -32,24 +32,33 @@ def orbit(views: int = 100, width: int = 128, seed: int = 0) -> tuple[Photograph
     """
     if views < 2 or width < 8:
         raise ValueError(f"orbit: expected at least 2 views of 8 pixels, got {views} of {width}")
-    focal = width / 2 / math.tan(math.radians(FIELD_OF_VIEW_DEG / 2))
-    camera = Camera(focal, focal, (width - 1) / 2, (width - 1) / 2, width, width)
     step = SECONDS / views
     train = step * np.arange(views)
     held_out = step * (np.unique(np.linspace(0, views - 2, min(_HELD_OUT, views - 1)).round()) + 0.5)
-    paint = jnp.asarray(np.random.default_rng(seed).uniform(0, 2 * math.pi, 6), jnp.float32)
-    photograph = jax.jit(partial(_photograph, camera))
+    lens, texture = camera(width), paint(seed)
+    photograph = jax.jit(lambda T: jnp.round(255 * image(lens, T, texture)).astype(jnp.uint8))
 
     def shots(t, part):
         T_world_cam = orbit_poses(t)
-        rgb = [np.asarray(photograph(jnp.asarray(T, jnp.float32), paint)) for T in T_world_cam]
+        rgb = [np.asarray(photograph(jnp.asarray(T, jnp.float32))) for T in T_world_cam]
         files = tuple(f"{part}/{index:03d}.png" for index in range(len(t)))
         notes = (f"synthetic orbit, {len(t)} views of {width} x {width} px, exact poses and stamps",)
         return Photographs(
-            f"orbit {part}", camera, t, np.stack(rgb), T_world_cam, NEAR, FAR, "depth", files, notes
+            f"orbit {part}", lens, t, np.stack(rgb), T_world_cam, NEAR, FAR, "depth", files, notes
         )
 
     return shots(train, "train"), shots(held_out, "held_out")
+
+
+def camera(width: int) -> Camera:
+    """The lens of all views, for images of `width` x `width` pixels."""
+    focal = width / 2 / math.tan(math.radians(FIELD_OF_VIEW_DEG / 2))
+    return Camera(focal, focal, (width - 1) / 2, (width - 1) / 2, width, width)
+
+
+def paint(seed: int) -> Float[Array, "6"]:
+    """What turns and tints the object's texture."""
+    return jnp.asarray(np.random.default_rng(seed).uniform(0, 2 * math.pi, 6), jnp.float32)
 
 
 def orbit_poses(t: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 4 4"]:
@@ -72,10 +81,10 @@ def orbit_poses(t: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 4 4"]:
     return T_world_cam
 
 
-def _photograph(
-    camera: Camera, T_world_cam: Float[Array, "4 4"], paint: Float[Array, "6"]
-) -> UInt8[Array, "h w 3"]:
-    """One image; every pixel is the mean over a grid of rays in it, against white."""
+def image(
+    camera: Camera, T_world_cam: Float[Array, "4 4"], paint: Float[Array, "6"], background: float = 1.0
+) -> Float[Array, "h w 3"]:
+    """The object from a pose, colours in [0, 1]; every pixel is the mean over a grid of rays in it."""
     offsets = (np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5
     x = (np.arange(camera.width)[:, None] + offsets).ravel()
     y = (np.arange(camera.height)[:, None] + offsets).ravel()
@@ -83,13 +92,12 @@ def _photograph(
     direction = pixel_direction(camera, jnp.asarray(pixels, jnp.float32))
     direction = jnp.matmul(direction, T_world_cam[:3, :3].T, precision="highest")
     direction = direction / jnp.linalg.norm(direction, axis=-1, keepdims=True)
-    rgb = jax.vmap(partial(_trace, paint, T_world_cam[:3, 3]))(direction)
-    rgb = rgb.reshape(camera.height, _SAMPLES, camera.width, _SAMPLES, 3).mean((1, 3))
-    return jnp.round(255 * rgb).astype(jnp.uint8)
+    rgb = jax.vmap(partial(_trace, paint, background, T_world_cam[:3, 3]))(direction)
+    return rgb.reshape(camera.height, _SAMPLES, camera.width, _SAMPLES, 3).mean((1, 3))
 
 
 def _trace(
-    paint: Float[Array, "6"], origin: Float[Array, "3"], direction: Float[Array, "3"]
+    paint: Float[Array, "6"], background: float, origin: Float[Array, "3"], direction: Float[Array, "3"]
 ) -> Float[Array, "3"]:
     """Colour of what a ray of unit length meets."""
     start = -jnp.vdot(origin, direction) - _RADIUS  # enters the ball around the object
@@ -103,7 +111,7 @@ def _trace(
     light = jnp.asarray([0.4, -0.5, 0.77])
     shade = 0.45 + 0.55 * jnp.maximum(jnp.vdot(normal, light) / (jnp.linalg.norm(normal) + 1e-6), 0)
     hit = (distance(point) < 0.02) & (depth < start + 2 * _RADIUS)
-    return jnp.where(hit, shade * _albedo(paint, point), 1.0)
+    return jnp.where(hit, shade * _albedo(paint, point), background)
 
 
 def distance(point: Float[Array, "3"]) -> Float[Array, ""]:

@@ -69,6 +69,13 @@ def check_poses(
     return orthonormal(T_world_cam, where)
 
 
+def extent_depths(T_world_cam: Float[np.ndarray, "n 4 4"]) -> tuple[float, float]:
+    """Near and far where nothing else tells them: 0.1 and 100 times the cameras' extent (1 if they rest)."""
+    centres = T_world_cam[:, :3, 3]
+    extent = float(np.linalg.norm(centres - centres.mean(0), axis=1).max()) or 1.0
+    return 0.1 * extent, 100 * extent
+
+
 def _on_white(image: Image.Image) -> tuple[Image.Image, bool]:
     """The image in 8-bit RGB, what shows through it white, and whether anything does."""
     if image.mode.startswith(("I", "F")):  # Pillow would clip these

@@ -17,6 +17,7 @@ from jaxpose.data.images import (
     found,
     frame_times,
     name_of,
+    only,
     published,
     read_color,
     read_depth,
@@ -83,11 +84,7 @@ def _sequence_folder(path: Path) -> Path:
     if any(_FRAME.fullmatch(file.name) for file in path.iterdir()):
         return path
     sequences = sorted(folder for folder in path.glob("seq-*") if folder.is_dir())
-    if len(sequences) == 1:
-        return sequences[0]
-    several = f"{len(sequences)} sequences, name one of them: {some([folder.name for folder in sequences])}"
-    got = several if sequences else found(path)
-    raise DataError(f"{path}: expected {_LAYOUT}, or one folder seq-* of them, got {got}")
+    return only(sequences, path, f"{_LAYOUT}, or one folder seq-* of them", "sequences")
 
 
 def _list_frames(folder: Path) -> tuple[list[_Files], tuple[str, ...]]:

@@ -39,7 +39,7 @@ _CAMERAS: dict[str, tuple[Pinhole, tuple[float, ...]]] = {
 }
 
 
-class _Stamped(NamedTuple):
+class Stamped(NamedTuple):
     """A list of images."""
 
     t: Float[np.ndarray, " n"]  # seconds since 1970
@@ -69,7 +69,7 @@ def load(path: Path | str, *, max_difference_s: float = 0.02, depth_per_metre: f
     folder = Path(path)
     if not folder.is_dir():
         raise DataError(f"{folder}: expected a folder with rgb.txt and depth.txt, got {found(folder)}")
-    color, depth = _read_list(folder / "rgb.txt"), _read_list(folder / "depth.txt")
+    color, depth = read_list(folder / "rgb.txt"), read_list(folder / "depth.txt")
     rows, partners = _pairs(folder, color.t, depth.t, max_difference_s)
     stamps = color.t[rows]
     colors, depths = [color.files[i] for i in rows], [depth.files[i] for i in partners]
@@ -92,7 +92,7 @@ def load(path: Path | str, *, max_difference_s: float = 0.02, depth_per_metre: f
     )
 
 
-def _read_list(file: Path) -> _Stamped:
+def read_list(file: Path) -> Stamped:
     """Lines of `stamp name`, names relative to the list, stamps increasing."""
     if not file.is_file():
         raise DataError(f"{file}: expected lines of a stamp and a file name, got {found(file)}")
@@ -115,7 +115,7 @@ def _read_list(file: Path) -> _Stamped:
         files.append(file.parent / name)
     if not stamps:
         raise DataError(f"{file}: expected lines of a stamp and a file name, got none")
-    return _Stamped(np.array(stamps), files)
+    return Stamped(np.array(stamps), files)
 
 
 def _pairs(
@@ -140,7 +140,7 @@ def _pairs(
 
 
 def _alone(
-    kind: str, other: str, images: _Stamped, used: Int[np.ndarray, " k"], limit: float
+    kind: str, other: str, images: Stamped, used: Int[np.ndarray, " k"], limit: float
 ) -> tuple[str, ...]:
     """A note on images that found no partner."""
     alone = [images.files[i].name for i in np.setdiff1d(np.arange(len(images.t)), used)]

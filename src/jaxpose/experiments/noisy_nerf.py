@@ -8,58 +8,34 @@ by side.
 
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import imageio.v3 as imageio
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxpose import command, io, io_checkpoint, metrics, nerf, plots_nerf
+from jaxpose import command, io, plots_nerf
 from jaxpose.data import blender
-from jaxpose.errors import DataError
+from jaxpose.experiments import joint_loop
+from jaxpose.experiments.joint_loop import Loaded, OnProgress, Outcome, Trained
 from jaxpose.experiments.noisy_nerf_measure import PROTOCOL, Measured, measure
 from jaxpose.experiments.noisy_nerf_options import (
-    CHUNK,
     ORBIT,
     Config,
-    NetConfig,
     Problem,
     decisive,
     load,
 )
-from jaxpose.experiments.noisy_nerf_report import Progress, progress_bar, report, table
+from jaxpose.experiments.noisy_nerf_report import progress_bar, report, table
 from jaxpose.experiments.noisy_nerf_setup import Setup, build, describe, splined
 from jaxpose.experiments.noisy_nerf_studies import STUDIES
-from jaxpose.fields import set_progress
 from jaxpose.io_camera import write_camera
 from jaxpose.io_field import write_field
 from jaxpose.io_transforms import write_transforms
-from jaxpose.nerf import State, Trainer
 from jaxpose.plots_nerf import History
-
-_SAVE_EVERY_S = 30.0
-_COLUMNS = ("step", "loss", "psnr", "rotation_deg", "translation", "seconds")
-
-OnProgress = Callable[[Progress], None]
-
-
-class Outcome(NamedTuple):
-    """Where a run was written, and its results; those of a study under `runs`, by label."""
-
-    folder: Path
-    results: dict[str, Any]
-
-
-class Trained(NamedTuple):
-    """Where a training stands, and how it went there: rows of step, loss, PSNR, errors and seconds."""
-
-    state: State
-    history: Float[np.ndarray, "c 6"]  # NaN where the training has not been
 
 
 def run(config: Config, on_progress: OnProgress | None = None) -> Outcome:
@@ -78,21 +54,8 @@ def run(config: Config, on_progress: OnProgress | None = None) -> Outcome:
         inner.mkdir(exist_ok=True)
         results[label] = _single(replace(changed, study=None), problem, inner, on_progress, label)
         histories[label] = _history(np.array(results[label]["history"], float))
-    whole = {
-        "experiment": "noisy_nerf",
-        "study": config.study,
-        "seed": config.seed,
-        "smoke": config.smoke,
-        "runs": results,
-        "versions": io.versions(),
-        "wall_s": time.perf_counter() - started,
-        "peak_rss_bytes": io.peak_rss_bytes(),
-    }
     plots_nerf.curves(folder / "curves.png", histories, f"{_title(problem)}: {config.study}")
-    io.write_json(folder / "config.json", config)
-    io.write_text(folder / "table.md", table(results) + "\n")
-    io.write_json(folder / "results.json", whole)
-    return Outcome(folder, whole)
+    return joint_loop.write_study(folder, "noisy_nerf", config, results, table(results), started)
 
 
 def train(
@@ -104,82 +67,30 @@ def train(
     label: str,
 ) -> Trained:
     """Train to the end, from the checkpoint if there is one, and keep one as it goes."""
-    trainer, trained = _fresh(config, problem, setup)
-    steps = setup.train.steps
-    if checkpoint.exists():
-        trained = io_checkpoint.load(checkpoint, trained)
-    state, history = trained.state, trained.history.copy()
-    poses = pose_reader(setup)
-    done = int(state.step)
-    before = history[done // CHUNK - 1, -1] if done else 0.0
-    started = saved = time.perf_counter()
-    for first in range(done, steps, CHUNK):
-        state, losses = trainer.advance(state, setup.views, CHUNK)
-        if config.pose == "spline_reset":
-            smooth = splined(state.pose, problem.train.t, config.spline_knots, config.spline_smoothing)
-            state = state._replace(pose=smooth)
-        loss = float(losses.mean())
-        if not np.isfinite(loss):
-            raise DataError(f"step {first + CHUNK}: expected a finite loss, got {loss}")
-        errors = metrics.pose_errors(poses(state.pose), problem.train.T_world_cam)
-        now = time.perf_counter()
-        psnr = -10 * np.log10(loss)
-        row = (first + CHUNK, loss, psnr, errors.rotation_deg, errors.translation, before + now - started)
-        history[first // CHUNK] = row
-        if now - saved > _SAVE_EVERY_S or first + CHUNK == steps:
-            io_checkpoint.save(checkpoint, Trained(state, history))
-            saved = now
-        if on_progress is not None:
-            on_progress(Progress(label, steps, problem.extent, *row[:-1]))
-    return Trained(state, history)
+    poses = joint_loop.pose_reader(setup.field, problem.train.t)
 
+    def between(state):
+        if config.pose != "spline_reset":
+            return state
+        smooth = splined(state.pose, problem.train.t, config.spline_knots, config.spline_smoothing)
+        return state._replace(pose=smooth)
 
-class Loaded(NamedTuple):
-    """A finished run: `setup.field.pose(state.pose, t)` is the camera's pose at any time [s], and
-    `setup.scene.query(state.scene, point, direction)` the density and colour of the scene."""
-
-    problem: Problem
-    setup: Setup
-    state: State
-
-
-def load_run(folder: Path | str) -> Loaded:
-    """The scene and the trajectory that a run has left in its folder; its data are read again.
-
-    DataError or OSError for a folder that holds no run.
-    """
-    settings = json.loads((Path(folder) / "settings.json").read_text())
-    net = settings.pop("net")
-    window = net.pop("window")
-    config = Config(
-        **settings | {"data": Path(settings["data"])}, net=NetConfig(**net, window=window and tuple(window))
+    return joint_loop.train(
+        setup,
+        joint_loop.fresh(setup, config.seed),
+        setup.views,
+        lambda params: joint_loop.mean_errors(poses(params), problem.train.T_world_cam),
+        checkpoint,
+        on_progress,
+        label=label,
+        extent=problem.extent,
+        between=between,
     )
-    problem = load(config)
-    setup = build(config, problem)
-    state = io_checkpoint.load(Path(folder) / "checkpoint.npz", _fresh(config, problem, setup)[1]).state
-    scene = set_progress(state.scene, jnp.ones(()))
-    return Loaded(problem, setup, state._replace(scene=scene))
 
 
-def pose_reader(setup: Setup) -> Callable[[Any], Float[np.ndarray, "n 4 4"]]:
-    """Camera-to-world poses of the training images, from the parameters of the field."""
-    compiled = jax.jit(lambda params: jax.vmap(setup.field.pose, (None, 0))(params, setup.views.t))
-    return lambda params: np.asarray(compiled(params), np.float64)
-
-
-def _fresh(config: Config, problem: Problem, setup: Setup) -> tuple[Trainer, Trained]:
-    """The compiled training and where it starts."""
-    trainer = nerf.trainer(
-        setup.scene,
-        setup.field,
-        problem.train.camera,
-        setup.depths,
-        setup.scene_rates,
-        setup.pose_rates,
-        setup.train,
-    )
-    history = np.full((setup.train.steps // CHUNK, len(_COLUMNS)), np.nan)
-    return trainer, Trained(trainer.start(jax.random.key(config.seed)), history)
+def load_run(folder: Path | str) -> Loaded[Problem, Setup]:
+    """What a run has left in its folder, as `joint_loop.load_run`."""
+    return joint_loop.load_run(folder, Config, load, build)
 
 
 def main(args: Sequence[str] | None = None) -> None:
@@ -194,53 +105,30 @@ def _single(
     """One training, measured and written; what a killed or finished run has left is used with `resume`."""
     started = time.perf_counter()
     checkpoint, finished = folder / "checkpoint.npz", folder / "results.json"
-    _prepare(folder, config)
+    joint_loop.prepare(folder, config, decisive(config), resume=config.resume)
     if finished.exists():
         return json.loads(finished.read_text())
     setup = build(config, problem)
     trained = train(config, problem, setup, checkpoint, on_progress, label)
-    T_world_cam = pose_reader(setup)(trained.state.pose)
+    T_world_cam = joint_loop.pose_reader(setup.field, problem.train.t)(trained.state.pose)
     measured = measure(config, problem, setup, trained.state, T_world_cam)
     _draw(folder, config, problem, measured, trained)
     _write_poses(folder, config, problem, measured)
     span = (float(problem.train.t[0]), float(problem.train.t[-1]))
     factors = setup.factors(trained.state.pose)
     write_field(folder / "field.npz", span, factors, alignment=measured.alignment)
-    seconds = float(trained.history[-1, -1])
-    results = {
-        "experiment": "noisy_nerf",
-        "data": problem.about,
-        "training": describe(config, setup),
-        "protocol": PROTOCOL,
-        "seed": config.seed,
-        "smoke": config.smoke,
+    results = joint_loop.results_of(
+        "noisy_nerf",
+        config,
+        trained,
+        started,
+        data=problem.about,
+        training=describe(config, setup),
+        protocol=PROTOCOL,
         **measured.numbers,
-        "train_s": seconds,
-        "seconds_per_step": seconds / setup.train.steps,
-        "history_columns": _COLUMNS,
-        "history": trained.history,
-        "versions": io.versions(),
-        "wall_s": time.perf_counter() - started,
-        "peak_rss_bytes": io.peak_rss_bytes(),
-    }
+    )
     io.write_json(finished, results)  # last: with it the run counts as finished
     return results
-
-
-def _prepare(folder: Path, config: Config) -> None:
-    """Leave in the folder the config, and earlier results only if they are this run's and to be kept."""
-    stored = folder / "settings.json"
-    settings = json.loads(json.dumps(decisive(config), default=_named))
-    if not command.resumes(folder, stored, settings, config.resume):
-        for name in ("checkpoint.npz", "results.json"):
-            (folder / name).unlink(missing_ok=True)
-        io.write_json(stored, settings)
-    io.write_json(folder / "config.json", config)
-
-
-def _named(value: Any) -> Any:
-    """A path as text, a nested config as a dict."""
-    return str(value) if isinstance(value, Path) else vars(value)
 
 
 def _draw(folder: Path, config: Config, problem: Problem, measured: Measured, trained: Trained) -> None:
@@ -296,8 +184,10 @@ def _title(problem: Problem) -> str:
     return f"{about['data']}, {about['images']} views of {width}x{height}\nnoise {about['noise']}"
 
 
-def _history(rows: Float[np.ndarray, "c 6"]) -> History:
-    return History(rows[:, 0].astype(int), *rows[:, 1:5].T)
+def _history(rows: Float[np.ndarray, "c 5"]) -> History:
+    """For a picture: with the PSNR that a mean squared colour error is."""
+    step, loss, rotation_deg, translation, _ = rows.T
+    return History(step.astype(int), loss, -10 * np.log10(loss), rotation_deg, translation)
 
 
 if __name__ == "__main__":

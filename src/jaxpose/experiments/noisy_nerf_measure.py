@@ -8,13 +8,14 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from jaxpose import metrics, nerf
+from jaxpose.experiments.joint_measure import likeness, means, pose_numbers
 from jaxpose.experiments.noisy_nerf_options import Config, Problem
 from jaxpose.experiments.noisy_nerf_setup import Setup
 from jaxpose.fields import set_progress
-from jaxpose.metrics import PoseErrors, Similarity
-from jaxpose.metrics_image import lpips, ssim
-from jaxpose.nerf import State, Viewer
+from jaxpose.metrics import Similarity
+from jaxpose.nerf import Viewer
 from jaxpose.plots_nerf import HeldOut
+from jaxpose.train import State
 
 PROTOCOL = {
     "alignment": "similarity that maps estimated camera centres to the true ones (scale: ratio of spreads), "
@@ -36,17 +37,6 @@ class Measured(NamedTuple):
     T_start: Float[np.ndarray, "n 4 4"]
     T_estimate: Float[np.ndarray, "n 4 4"]
     alignment: Similarity  # of the latter
-
-
-def pose_numbers(errors: PoseErrors, extent: float) -> dict[str, float]:
-    """Means of pose errors; translations also in percent of the cameras' extent."""
-    return {
-        "rotation_error_deg": errors.rotation_deg,
-        "translation_error": errors.translation,
-        "translation_error_percent": 100 * errors.translation / extent,
-        "centre_error": errors.centre,
-        "centre_error_percent": 100 * errors.centre / extent,
-    }
 
 
 def measure(
@@ -77,8 +67,8 @@ def measure(
             as_settled.append(_settled(viewer, scene, problem, index, pose, key))
     numbers = {
         **pose_numbers(errors, problem.extent),
-        **_means(as_aligned),
-        "settled": _means(as_settled) if as_settled else None,
+        **means(as_aligned),
+        "settled": means(as_settled) if as_settled else None,
         "start": pose_numbers(at_start, problem.extent),
         "largest": {
             "rotation_error_deg": np.nanmax(errors.rotation_errors_deg),
@@ -115,20 +105,7 @@ def _seen(
     rgb, depth = viewer.image(scene, jnp.asarray(pose, jnp.float32))
     rendered = np.clip(np.asarray(rgb, np.float64), 0, 1)
     photograph = problem.held_out.rgb[index]
-    truth = photograph / 255
-    numbers = {
-        "psnr": metrics.psnr(rendered, truth),
-        "ssim": ssim(rendered, truth),
-        "lpips": lpips(rendered, truth),
-    }
     label = problem.held_out.files[index]
-    return numbers, HeldOut(label, photograph, rendered, np.asarray(depth, np.float64))
-
-
-def _means(views: list[dict[str, float | None]]) -> dict[str, float | None]:
-    """Means over views; None where a number could not be had."""
-    columns = {name: [view[name] for view in views] for name in views[0]}
-    return {
-        name: None if None in values else float(np.mean([v for v in values if v is not None]))
-        for name, values in columns.items()
-    }
+    return likeness(rendered, photograph / 255), HeldOut(
+        label, photograph, rendered, np.asarray(depth, np.float64)
+    )

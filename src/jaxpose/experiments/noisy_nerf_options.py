@@ -1,6 +1,5 @@
 """Options of the noisy-pose experiment, and the photographs and disturbed poses that they name."""
 
-import math
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -9,30 +8,18 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.distance import pdist
 
+from jaxpose.command import check_least, check_resume
 from jaxpose.data import blender, llff, noise
 from jaxpose.data.orbit import DIAMETER, orbit
 from jaxpose.errors import DataError
-from jaxpose.nn import Activation
+from jaxpose.experiments.joint_loop import CHUNK, NetConfig
 from jaxpose.recording import Photographs, every, take
 
 Pose = Literal["posenet", "table", "bspline", "spline_reset"]
 Study = Literal["fields", "encoding", "size", "spline", "ablations"]
 ORBIT = Path("orbit")
-CHUNK = 100  # steps in one compiled call; a table is reset to a spline as often
 _WIDTHS = {"fast": 100, "paper": 400}  # [px]
 _SMOKE_WIDTH, _SMOKE_VIEWS = 24, 8
-
-
-@dataclass(frozen=True)
-class NetConfig:
-    """PoseNet's variants of tables 3 and 12; the defaults are the paper's main network."""
-
-    octaves: int = 5  # of the time encoding; 0: time alone
-    layers: int = 8
-    width: int = 256
-    coupled: bool = False  # one network with 7 outputs
-    activation: Activation = "relu"
-    window: tuple[float, float] | None = None  # coarse-to-fine on the time encoding, shares of the training
 
 
 @dataclass(frozen=True)
@@ -70,22 +57,18 @@ class Config:
     name: str | None = None  # of the run folder
 
     def __post_init__(self):
-        for option, least in (
-            ("noise_translation", 0), ("noise_rotation_deg", 0), ("noise_sigma", 0), ("seed", 0),
-            ("settle_steps", 0), ("spline_smoothing", 0), ("every", 1), ("orbit_views", 4),
-            ("image_width", 8), ("steps", CHUNK), ("rays", 1), ("spline_knots", 2),
-        ):  # fmt: skip
-            value = getattr(self, option)
-            if value is not None and not least <= value < math.inf:
-                raise ValueError(f"--{option.replace('_', '-')}: expected at least {least}, got {value}")
+        check_least(
+            self,
+            noise_translation=0, noise_rotation_deg=0, noise_sigma=0, seed=0, settle_steps=0,
+            spline_smoothing=0, every=1, orbit_views=4, image_width=8, steps=CHUNK, rays=1, spline_knots=2,
+        )  # fmt: skip
         if self.spline_smoothing == 0:
             raise ValueError("--spline-smoothing: expected a positive number, got 0")
         if self.noise_rotation_deg > 180:
             raise ValueError(f"--noise-rotation-deg: expected at most 180, got {self.noise_rotation_deg:g}")
         if self.steps is not None and self.steps % CHUNK:
             raise ValueError(f"--steps: expected a multiple of {CHUNK}, got {self.steps}")
-        if self.resume and self.out is None and self.name is None:
-            raise ValueError("--resume: expected --out DIR or --name NAME with it")
+        check_resume(self)
 
 
 # What a run's numbers do not depend on.

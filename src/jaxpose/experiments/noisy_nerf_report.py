@@ -1,39 +1,27 @@
 """What the noisy-pose experiment says: a bar while it trains, then numbers with their protocol."""
 
-from collections.abc import Callable
+import math
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-from jaxpose.command import markdown_table, step_bar
+from jaxpose.command import markdown_table, number
+from jaxpose.experiments import joint_loop
+from jaxpose.experiments.joint_loop import OnProgress, Progress
 
 _COLUMNS: tuple[str, ...] = (
     "run", "RE [deg]", "TE [units]", "TE [%]", "centres [%]", "PSNR [dB]", "SSIM", "LPIPS", "train [s]",
 )  # fmt: skip
 
 
-class Progress(NamedTuple):
-    """Where a training is: after `step` of `steps`."""
-
-    label: str
-    steps: int
-    extent: float  # [scene units]
-    step: int
-    loss: float
-    psnr: float  # [dB] of the training rays
-    rotation_deg: float
-    translation: float  # [scene units]
-
-
-def progress_bar() -> Callable[[Progress], None]:
+def progress_bar() -> OnProgress:
     """A callback for `run` that draws a bar on stderr for each training."""
-    bar = step_bar()
 
-    def on_progress(progress: Progress) -> None:
+    def describe(progress: Progress) -> dict[str, str]:
         off = f"{progress.rotation_deg:.2f} deg {100 * progress.translation / progress.extent:.2f}%"
-        state = {"loss": f"{progress.loss:.5f}", "PSNR": f"{progress.psnr:.2f} dB", "off": off}
-        bar(progress.label or "training", progress.step, progress.steps, state)
+        psnr = f"{-10 * math.log10(progress.loss):.2f} dB"
+        return {"loss": f"{progress.loss:.5f}", "PSNR": psnr, "off": off}
 
-    return on_progress
+    return joint_loop.progress_bar(describe)
 
 
 def table(runs: dict[str, dict[str, Any]]) -> str:
@@ -45,9 +33,9 @@ def table(runs: dict[str, dict[str, Any]]) -> str:
             f"{run['translation_error']:.4f}",
             f"{run['translation_error_percent']:.3f}",
             f"{run['centre_error_percent']:.3f}",
-            _number(run["psnr"], 2),
-            _number(run["ssim"], 3),
-            _number(run["lpips"], 3),
+            number(run["psnr"], 2),
+            number(run["ssim"], 3),
+            number(run["lpips"], 3),
             f"{run['train_s']:.0f}",
         )
         for label, run in runs.items()
@@ -81,7 +69,7 @@ def report(folder: Path, results: dict[str, Any]) -> str:
         f"  PSNR ...     {protocol['psnr, ssim, lpips']}",
         *(
             f"  settled      {label}: PSNR {run['psnr']:.2f} dB, SSIM {run['ssim']:.3f}, "
-            f"LPIPS {_number(run['lpips'], 3)}"
+            f"LPIPS {number(run['lpips'], 3)}"
             for label, run in settled.items()
         ),
         f"  cost         {results['wall_s']:.0f} s in all, "
@@ -89,7 +77,3 @@ def report(folder: Path, results: dict[str, Any]) -> str:
         f"  written to   {folder}",
     ]
     return "\n".join(lines)
-
-
-def _number(value: float | None, digits: int) -> str:
-    return "n/a" if value is None else f"{value:.{digits}f}"

@@ -13,11 +13,13 @@ from jaxtyping import Array, Float
 from scipy.interpolate import make_splrep
 
 from jaxpose import fields
-from jaxpose.experiments.noisy_nerf_options import CHUNK, Config, Problem
+from jaxpose.experiments.joint_loop import CHUNK
+from jaxpose.experiments.noisy_nerf_options import Config, Problem
 from jaxpose.fields import Params, PoseField, PoseNetConfig
 from jaxpose.io_field import Factor, bspline_factor, posenet_factor, stamped_factor, table_factor
-from jaxpose.nerf import Depths, Rate, TrainConfig, Views
+from jaxpose.nerf import Depths, TrainConfig, Views, trainer
 from jaxpose.scenes import NerfConfig, SceneField, nerf
+from jaxpose.train import Rate, Trainer
 
 _FAST_SCENE = NerfConfig(
     layers=4, width=96, skip=2, colour_width=48, octaves=7, window=(0.15, 0.5), quiet=True
@@ -55,6 +57,7 @@ class Setup(NamedTuple):
     train: TrainConfig
     depths: Depths
     views: Views
+    trainer: Trainer
     settle_rate: float
 
 
@@ -76,15 +79,18 @@ def build(config: Config, problem: Problem) -> Setup:
     T_start = jnp.asarray(problem.T_start, jnp.float32)
     start = stamped_factor(t, T_start)
     world = config.side == "world"
+    field = fields.refine(field, fields.stamped(t, T_start), side="world" if world else "body")
+    depths = Depths(photographs.near, photographs.far, photographs.spacing)
     return Setup(
         scene,
-        fields.refine(field, fields.stamped(t, T_start), side="world" if world else "body"),
+        field,
         lambda params: (factor(params), start) if world else (start, factor(params)),
         scene_rates,
         rates,
         train,
-        Depths(photographs.near, photographs.far, photographs.spacing),
+        depths,
         Views(t, jnp.asarray(photographs.rgb)),
+        trainer(scene, field, photographs.camera, depths, scene_rates, rates, train),
         _BARF_SETTLE[barf],
     )
 

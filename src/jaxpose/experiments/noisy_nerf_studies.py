@@ -4,7 +4,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import get_args
 
-from jaxpose.experiments.noisy_nerf_options import Config, NetConfig, Pose, Study
+from jaxpose.experiments.joint_loop import NetConfig
+from jaxpose.experiments.noisy_nerf_options import Config, Pose, Study
 
 # Label and variant of PoseNet in the order of table 3; c2f opens its bands as BARF opens the scene's.
 _ENCODING = {

@@ -61,9 +61,7 @@ class Config:
     name: str | None = None  # of the run folder
 
     def __post_init__(self):
-        for option in ("motions", "points"):
-            if getattr(self, option) < 1:
-                raise ValueError(f"--{option}: expected at least 1, got {getattr(self, option)}")
+        command.check_least(self, motions=1, points=1)
         if self.seed < 0:
             raise ValueError(f"--seed: expected 0 or more, got {self.seed}")
         if self.steps is not None and (self.steps < CHUNK or self.steps % CHUNK):
@@ -72,8 +70,7 @@ class Config:
             raise ValueError("--setup homography: expected --pose table and no --compare")
         if self.compare and self.pose is not None:
             raise ValueError(f"--compare: expected no --pose, as it runs all of them, got {self.pose}")
-        if self.resume and self.out is None and self.name is None:
-            raise ValueError("--resume: expected --out DIR or --name NAME with it")
+        command.check_resume(self)
 
 
 class Outcome(NamedTuple):

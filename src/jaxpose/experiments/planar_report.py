@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxpose.command import markdown_table, step_bar
+from jaxpose.command import markdown_table, number, step_bar
 from jaxpose.experiments.planar_task import PATCHES, PROTOCOL, Photo
 from jaxpose.experiments.planar_warps import RESET_EVERY, SPLINE_KNOTS, Warps
 
@@ -94,11 +94,11 @@ def table(by_field: dict[str, dict[str, Any]]) -> str:
         rows.append((
             pose,
             f"{count - len(results['failures'])} of {count}",
-            _number(error["mean"], 3),
-            _number(error["median"], 3),
-            f"{_number(error['min'], 3)} to {_number(error['max'], 3)}",
-            _number(results["psnr"]["mean"], 2),
-            _number(results["seconds_per_motion"]["median"], 1),
+            number(error["mean"], 3),
+            number(error["median"], 3),
+            f"{number(error['min'], 3)} to {number(error['max'], 3)}",
+            number(results["psnr"]["mean"], 2),
+            number(results["seconds_per_motion"]["median"], 1),
         ))  # fmt: skip
     return markdown_table(rows)
 
@@ -120,8 +120,8 @@ def report(folder: Path, results: dict[str, Any]) -> str:
         table(by_field),
         "",
         f"  CE           {about['corner_error']};",
-        f"               {_number(start['mean'], 1)} px at the start, {_number(start['min'], 1)} to "
-        f"{_number(start['max'], 1)}",
+        f"               {number(start['mean'], 1)} px at the start, {number(start['min'], 1)} to "
+        f"{number(start['max'], 1)}",
         f"  success      {about['success']}",
         f"  PSNR         {about['psnr']}",
         f"  cost         {cost}; s / motion: median",
@@ -132,7 +132,3 @@ def report(folder: Path, results: dict[str, Any]) -> str:
 def _spread(motions: list[dict[str, Any]], key: str) -> dict[str, float]:
     values = np.array([motion[key] for motion in motions], float)  # what is not finite is null in a file
     return {"mean": values.mean(), "median": np.median(values), "min": values.min(), "max": values.max()}
-
-
-def _number(value: float, digits: int) -> str:
-    return f"{value:.{digits}f}"

@@ -2,15 +2,18 @@
 
 import time
 from collections.abc import Callable
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from jaxpose import io
-from jaxpose.experiments import slam_checkpoint
-from jaxpose.experiments.slam_map import render_frame
+from jaxpose.experiments import slam_checkpoint, slam_map
 from jaxpose.plots import View
 from jaxpose.plots_preview import preview
 from jaxpose.recording import Recording
+from jaxpose.scenes import GridConfig, grid
 from jaxpose.slam.run import Progress
 from jaxpose.slam.state import SlamState
 from jaxpose.slam.world import scene_params
@@ -25,6 +28,7 @@ def keeper(folder: Path, recording: Recording, settings: dict[str, Any]) -> Call
     """A callback that writes the settings once, and checkpoint and preview every few seconds."""
     saved = time.perf_counter()
     next_preview = 0.0
+    viewer = lru_cache(maxsize=1)(lambda size: slam_map.viewer(grid(size), size, recording.camera))
 
     def keep(progress: Progress) -> None:
         nonlocal saved, next_preview
@@ -35,17 +39,21 @@ def keeper(folder: Path, recording: Recording, settings: dict[str, Any]) -> Call
             saved = time.perf_counter()
         now, last = time.perf_counter(), progress.index == progress.count - 1
         if now > next_preview or last:
-            _preview(folder / "preview.png", recording, progress.state)
+            _preview(folder / "preview.png", recording, progress.state, viewer)
             cost = time.perf_counter() - now
             next_preview = time.perf_counter() + max(_PREVIEW_EVERY_S, cost / _SHARE)
 
     return keep
 
 
-def _preview(path: Path, recording: Recording, state: SlamState) -> None:
+def _preview(
+    path: Path, recording: Recording, state: SlamState, viewer: Callable[[GridConfig], slam_map.Viewer]
+) -> None:
     frames, i = state.frames, state.done - 1
     T_world_cam = frames.T_world_body[: i + 1] @ recording.T_body_cam
-    seen = render_frame(recording, i, T_world_cam[i], state.grid, scene_params(state.map), width=_WIDTH)
-    label = f"t = {recording.t[i]:.1f} s"
-    view = View(label, seen.photograph, seen.rgb, seen.frame_depth, seen.depth)
+    frame = recording.read(i)
+    pixels = slam_map.every(recording.camera, _WIDTH)
+    column, row = np.moveaxis(pixels, -1, 0)
+    rgb, depth = viewer(state.grid)(scene_params(state.map), T_world_cam[i], pixels)
+    view = View(f"t = {recording.t[i]:.1f} s", frame.rgb, rgb, frame.depth[row, column], depth)
     preview(path, T_world_cam, frames.lost[: i + 1], view)

@@ -1,7 +1,10 @@
-"""A map seen from the frames' estimated poses: pictures of it, and how well it shows what was measured."""
+"""A map seen from poses: pictures of it, how well it shows what was measured, and its file."""
 
+import zipfile
 from collections.abc import Callable
-from functools import lru_cache, partial
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -9,18 +12,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
-from jaxpose import metrics
+from jaxpose import io, metrics
+from jaxpose.camera import Camera, pixel_direction
+from jaxpose.errors import DataError
 from jaxpose.plots import View
 from jaxpose.recording import Recording
-from jaxpose.scenes import GridConfig, grid
-from jaxpose.scenes.base import Params
-from jaxpose.slam.observe import Image, Pixels, SampleConfig, read_pixels, render_pixels
+from jaxpose.scenes import GridConfig, SceneField
+from jaxpose.slam.observe import Pixels, SampleConfig, render_pixels
 from jaxpose.slam.run import SlamResult
 
 _VIEW_WIDTH = 160  # [px] of rendered pictures, about
 _VIEWS = 4
 _MEASURED = 10  # frames of each kind
 _CHUNK = 4800  # rays rendered in one call
+_VERSION = 1  # of map.npz
 
 PROTOCOL = (
     f"map rendered from estimated poses of at most {_MEASURED} frames of each kind, about {_VIEW_WIDTH} px "
@@ -40,6 +45,21 @@ class Rendered(NamedTuple):
 
 
 Renderer = Callable[[int], Rendered]
+
+
+# From parameters, T_world_cam and pixels (u, v): colour in [0, 1] and depth [m] (0: nothing there).
+Viewer = Callable[
+    [Any, Float[np.ndarray, "4 4"], Int[np.ndarray, "h w 2"]],
+    tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]],
+]
+
+
+class SavedMap(NamedTuple):
+    """A map as a run folder keeps it, `map.npz`."""
+
+    grid: GridConfig
+    values: Float[np.ndarray, "x y z 4"]  # of the finest level: signed distance [m], red, green, blue
+    keyframes: Int[np.ndarray, " k"]  # frames, counted from the first of the trajectory
 
 
 def views(recording: Recording, result: SlamResult, render: Renderer) -> list[View]:
@@ -78,65 +98,80 @@ def _quality(render: Renderer, chosen: Bool[np.ndarray, " n"]) -> dict[str, Any]
 
 def renderer(recording: Recording, result: SlamResult) -> Renderer:
     """The frame with a given index, and the map as seen from its estimated pose."""
-    return lambda i: render_frame(recording, i, result.T_world_cam[i], result.grid, result.scene_params)
+    look = viewer(result.scene, result.grid, recording.camera)
+    pixels = every(recording.camera, _VIEW_WIDTH)
+    column, row = np.moveaxis(pixels, -1, 0)
+
+    def at(i: int) -> Rendered:
+        frame = recording.read(i)
+        rgb, depth = look(result.scene_params, result.T_world_cam[i], pixels)
+        photograph = np.asarray(frame.rgb)
+        return Rendered(
+            photograph, photograph[row, column] / 255, np.asarray(frame.depth)[row, column], rgb, depth
+        )
+
+    return at
 
 
-def render_frame(
-    recording: Recording,
-    i: int,
-    T_world_cam: Float[np.ndarray, "4 4"],
-    size: GridConfig,
-    scene_params: Params,
-    width: int = _VIEW_WIDTH,
-) -> Rendered:
-    """A frame and the map as seen from a pose, about `width` pixels wide.
+def viewer(scene: SceneField, grid: GridConfig, camera: Camera) -> Viewer:
+    """The map of a grid as seen from any pose of the camera; compiled once, whatever the pixels.
 
-    The measured depth plays no part in the rendering: a first pass over evenly spaced samples finds the
-    surface, a second one looks closely.
+    A first pass over evenly spaced samples finds the surface, a second one looks closely.
     """
-    camera = recording.camera
-    step = max(1, round(camera.width / width))
-    row, column = np.mgrid[step // 2 : camera.height : step, step // 2 : camera.width : step]
-    frame = recording.read(i)
-    image = Image(jnp.asarray(frame.rgb), jnp.asarray(frame.depth, jnp.float32))
-    pose = jnp.asarray(T_world_cam, jnp.float32)
-    render, count = _compiled(size), row.size
-    padded = np.arange(-(-count // _CHUNK) * _CHUNK) % count  # whole chunks: one shape is compiled
-    parts = []
-    for chunk in padded.reshape(-1, _CHUNK):
-        pixels = read_pixels(image, camera, jnp.asarray(row.flat[chunk]), jnp.asarray(column.flat[chunk]))
-        parts.append(jax.device_get(render(scene_params, pose, pixels)))
-    rgb, depth = (np.concatenate(x)[:count] for x in zip(*parts, strict=True))
-    photograph = np.asarray(frame.rgb)
-    return Rendered(
-        photograph,
-        photograph[row, column] / 255,
-        np.asarray(frame.depth)[row, column],
-        rgb.reshape(*row.shape, 3),
-        depth.reshape(row.shape),
-    )
-
-
-@lru_cache(maxsize=1)
-def _compiled(size: GridConfig):
-    """The rendering of pixels with a map of this size."""
-    scene = grid(size)
-    fine = SampleConfig(band=size.truncation, width=size.truncation / 8)
-    reach = float(np.linalg.norm(np.subtract(size.upper, size.lower)))
-    evenly = int(np.clip(reach / size.truncation * 4, 64, 256))
-    coarse = SampleConfig(front=evenly, surface=0, behind=0, band=size.truncation, width=size.truncation / 4)
+    fine = SampleConfig(band=grid.truncation, width=grid.truncation / 8)
+    reach = float(np.linalg.norm(np.subtract(grid.upper, grid.lower)))
+    evenly = int(np.clip(reach / grid.truncation * 4, 64, 256))
+    coarse = SampleConfig(front=evenly, surface=0, behind=0, band=grid.truncation, width=grid.truncation / 4)
 
     @jax.jit
-    def render(params, T_world_cam: Float[Array, "4 4"], pixels: Pixels):
+    def render(params, T_world_cam: Float[Array, "4 4"], pixel: Float[Array, "n 2"]):
         query, far = partial(scene.query, params), jnp.float32(reach)
-        unknown = pixels._replace(depth=jnp.zeros_like(pixels.depth))
+        direction = pixel_direction(camera, pixel)
+        unknown = Pixels(direction, jnp.zeros_like(direction[:, 0]), jnp.zeros_like(direction))
         found = render_pixels(query, T_world_cam, unknown, far, coarse)
         surface = jnp.where(found.opacity > 0.5, found.depth, 0)
-        seen = render_pixels(query, T_world_cam, pixels._replace(depth=surface), far, fine)
+        seen = render_pixels(query, T_world_cam, unknown._replace(depth=surface), far, fine)
         there = (surface > 0) & (seen.opacity > 0.5)
         return jnp.where(there[:, None], seen.rgb, 0.86), jnp.where(there, seen.depth, 0)
 
-    return render
+    def look(params, T_world_cam, pixels):
+        pose, count = jnp.asarray(T_world_cam, jnp.float32), pixels[..., 0].size
+        padded = np.arange(-(-count // _CHUNK) * _CHUNK) % count  # whole chunks: one shape is compiled
+        chunks = pixels.reshape(-1, 2)[padded].reshape(-1, _CHUNK, 2)
+        parts = [jax.device_get(render(params, pose, jnp.asarray(chunk, jnp.float32))) for chunk in chunks]
+        rgb, depth = (np.concatenate(x)[:count] for x in zip(*parts, strict=True))
+        return rgb.reshape(*pixels.shape[:2], 3), depth.reshape(pixels.shape[:2])
+
+    return look
+
+
+def every(camera: Camera, width: int) -> Int[np.ndarray, "h w 2"]:
+    """Every few pixels (u, v) of an image, to make a picture of about this width."""
+    step = max(1, round(camera.width / width))
+    row, column = np.mgrid[step // 2 : camera.height : step, step // 2 : camera.width : step]
+    return np.stack([column, row], axis=-1)
+
+
+def write_map(path: Path | str, saved: SavedMap) -> None:
+    """Write a map (npz, compressed): version, the fields of its `GridConfig`, values and keyframes."""
+    arrays = asdict(saved.grid) | {"values": saved.values, "keyframes": saved.keyframes}
+    with io.atomic(path) as temporary:
+        np.savez_compressed(temporary, allow_pickle=False, version=_VERSION, **arrays)
+
+
+def read_map(path: Path | str) -> SavedMap:
+    """Read what `write_map` wrote; DataError naming the file for what is not that."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            content = dict(file)
+        if content["version"] != _VERSION:
+            raise DataError(f"{path}: expected a map of version {_VERSION}, got {content['version']}")
+        lower, upper = (tuple(content[name].tolist()) for name in ("lower", "upper"))
+        voxel, truncation = float(content["voxel"]), float(content["truncation"])
+        config = GridConfig(lower, upper, voxel, int(content["levels"]), truncation)
+        return SavedMap(config, content["values"], content["keyframes"])
+    except (zipfile.BadZipFile, ValueError, KeyError, EOFError) as error:
+        raise DataError(f"{path}: expected a map, got {' '.join(str(error).split())}") from None
 
 
 def _evenly(indices: Int[np.ndarray, " n"], most: int) -> list[int]:

@@ -17,7 +17,7 @@ from jaxpose import command, io, metrics, plots
 from jaxpose.errors import DataError
 from jaxpose.experiments import slam_checkpoint
 from jaxpose.experiments.slam_keep import keeper
-from jaxpose.experiments.slam_map import Renderer, map_quality, renderer, views
+from jaxpose.experiments.slam_map import Renderer, SavedMap, map_quality, renderer, views, write_map
 from jaxpose.experiments.slam_measure import Accuracy, Inertial, accuracy, cost, inertial
 from jaxpose.experiments.slam_options import Options, Source, decisive, load, slam_config
 from jaxpose.experiments.slam_report import table
@@ -148,6 +148,8 @@ def _single(
         io.write_tum(folder / "reference.txt", io.Trajectory(recording.t, truth))
     span = (0.0, float(recording.t[-1] - recording.t[0]))
     write_field(folder / "field.npz", span, [bspline_factor(span, result.field_params)])
+    values = np.asarray(result.scene_params[0])
+    write_map(folder / "map.npz", SavedMap(result.grid, values, result.keyframes))
     images_folder = "." if options.data is None else options.data.resolve()
     notes = (*recording.notes, *_write_surface(folder, recording, result))
     write_camera(folder / "camera.json", recording.camera, recording.files, images_folder)

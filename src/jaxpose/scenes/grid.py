@@ -58,7 +58,7 @@ def grid(config: GridConfig) -> SceneField:
         steps = [RATIO ** (config.levels - 1 - level) for level in range(config.levels)]
         # A merged scene has one level, the finest.
         first, *rest = (
-            _trilinear(level, position / step)
+            trilinear(level, position / step)
             for level, step in zip(params, steps[-len(params) :], strict=True)
         )
         value = sum(rest, first)
@@ -150,8 +150,11 @@ def _refine(values: Float[Array, "x y z c"], axis: int) -> Float[Array, "_ _ _ c
     )
 
 
-def _trilinear(values: Float[Array, "x y z c"], position: Float[Array, "3"]) -> Float[Array, " c"]:
-    """Value at a position in cells. Four rows of two nodes: on a CPU the fastest of the ways tried."""
+def trilinear(values: Float[Array, "x y z c"], position: Float[Array, "3"]) -> Float[Array, " c"]:
+    """Value at a position in cells, outside that of the nearest face.
+
+    Four rows of two nodes: on a CPU the fastest of the ways tried.
+    """
     nodes = values.shape[:3]
     channels = values.shape[3]
     cell = jnp.floor(jax.lax.stop_gradient(position))

@@ -27,10 +27,12 @@ from jaxpose.slam.system import System
 from jaxpose.slam.track import Tracked
 from jaxpose.slam.world import scene_params
 
-_FAR_OFF = 0.08  # [m, rad] a prediction that may be off by more is searched around
+_HELD = 0.08  # [m, rad] a prediction from the IMU that cannot be off by more is as good as no loss
 _FARTHEST = 0.5  # [m, rad]
 _AROUND_CENTRES = 0.25  # [m, rad] a search reaches where nothing else is known
-_RECOGNISED = 0.7, 1.1  # share explained, and loss against the usual, of a camera that could be anywhere
+# After a loss: share explained, and loss against the usual, of a camera that could be anywhere, or not far off.
+_RECOGNISED = 0.7, 1.1
+_FOUND_AGAIN = 0.5, 1.3
 _RECKONED = 0.3  # [m, rad] a pose from the IMU alone is good enough to go on from
 _SHARP = 0.02  # [m, rad] a pose known less well is uncertain
 _LEAST_DEPTH = 0.01  # share of an image
@@ -58,7 +60,7 @@ def next_pose(
     if np.mean(frame.depth > 0) < _LEAST_DEPTH:
         return _moved(system, state, state.frames, dt, readings, predicted, None, lost=True)
     frames, tracked, lost = state.frames, None, True
-    for wide in (True,) if max(reach) > _FAR_OFF else (False, True):
+    for wide, key in zip((False, True), jax.random.split(key), strict=True):
         if wide:
             frames, T_ref_body = _searched(system, state, frame, image, predicted, reach, key)
             twist = np.asarray(se3.log(jnp.asarray(T_ref_body, jnp.float32)))
@@ -184,6 +186,7 @@ def _searched(
     spread = np.where(np.isfinite(reach), reach, _AROUND_CENTRES)
     found = system.world(state.grid).search(
         scene_params(state.map),
+        state.map.memory,
         jnp.asarray(np.resize(centres, (CENTRES, 4, 4)) @ T_body_cam, jnp.float32),
         jnp.asarray(spread, jnp.float32),
         image,
@@ -241,8 +244,8 @@ def _track(
     where = gauge(config.frame, float(t[last] - t[0]), T_world_ref, T_world_first, generator)
     return jax.device_get(
         system.world(state.grid).track(
-            scene_params(state.map), state.params, jnp.asarray(T_world_ref, jnp.float32), where, interval,
-            image, jnp.float32(state.far), key,
+            scene_params(state.map), state.map.memory, state.params, jnp.asarray(T_world_ref, jnp.float32),
+            where, interval, image, jnp.float32(state.far), key,
         )
     )  # fmt: skip
 
@@ -253,11 +256,12 @@ def _failed(system: System, state: SlamState, tracked: Tracked, reach: np.ndarra
     After a loss more is asked for: a wrong place may look right, and would be mapped.
     """
     frames, i = state.frames, state.done
-    losses = frames.loss[1:i][~frames.lost[1:i]][-30:]
+    losses = frames.loss[:i][~frames.lost[:i] & np.isfinite(frames.loss[:i])][-30:]
     usual = float(np.median(losses)) if len(losses) else np.inf
     least, most = system.config.track.minimum_valid, 2.0
-    held = system.config.senses_speed and max(reach) < _FAR_OFF
+    held = system.config.senses_speed and max(reach) < _HELD
     if frames.lost[max(i - 2, 0) : i].any() and not held:
-        least, most = (least, 1.3) if np.isfinite(reach).all() else _RECOGNISED
+        least, most = _FOUND_AGAIN if np.isfinite(reach).all() else _RECOGNISED
     explained = np.isfinite(tracked.loss) and tracked.valid >= least
-    return not (explained and tracked.loss < most * usual)
+    # One sigma is what the sensor's own noise leaves; without noise the usual loss would be next to nothing.
+    return not (explained and tracked.loss < most * max(usual, 1.0))

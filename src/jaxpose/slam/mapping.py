@@ -5,8 +5,13 @@ see the same place. `fused` solves for the signed distance in closed form: at ev
 weighted mean of all distances measured along the optical axis, which is what the gradient's L2 loss tends to
 when every frame is seen equally often (Curless and Levoy 1996). It has no step size, forgets nothing and
 costs one pass over the grid; the figures of both are in experiments/.
+
+The scene's distance is cut off close behind surfaces, as thin things have two sides. Beside it the fused map
+has a second one that reaches farther to both sides, and keeps where anything was measured: a camera is
+aligned to that one (`look_up`), from farther off.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal, NamedTuple
@@ -21,6 +26,7 @@ from jaxpose.losses import weighted_mean
 from jaxpose.render import Ray, composite, sdf_weights
 from jaxpose.scenes import GridConfig, SceneField, node_positions
 from jaxpose.scenes.base import Params
+from jaxpose.scenes.grid import trilinear
 from jaxpose.slam.observe import (
     Image,
     SampleConfig,
@@ -31,6 +37,7 @@ from jaxpose.slam.observe import (
 )
 
 _MEMORY = 100.0  # frames, at a depth of one metre: older ones are slowly forgotten
+_REACH = 8  # voxels to either side of a surface of which the wide distance knows
 
 
 @dataclass(frozen=True)
@@ -55,30 +62,66 @@ class MapState(NamedTuple):
     memory: Any
 
 
+class Nearby(NamedTuple):
+    """What a map says about a point: signed distance [m] to the surface, colour there, 1 where it knows."""
+
+    distance: Float[Array, ""]
+    rgb: Float[Array, "3"]
+    known: Float[Array, ""]
+
+
+Lookup = Callable[[Float[Array, "3"]], Nearby]
+
+
 def make_fuse(config: GridConfig, camera: Camera, band: float):
     """`init(params)` and the compiled step `update(state, image, T_world_cam)` of closed-form mapping.
 
-    `band` [m] is how far behind a surface a distance still counts as measured.
+    `band` [m] is how far behind a surface a distance of the scene still counts as measured. The memory
+    (x, y, z, 5) holds the weights of distance, colour and wide distance, then the wide distance [m] and 1
+    where it is known.
     """
     nodes = node_positions(config)
+    reach = _REACH * config.voxel
 
     @partial(jax.jit, donate_argnums=0)
     def update(state: MapState, image: Image, T_world_cam: Float[Array, "4 4"]) -> MapState:
-        ((values,), weight) = state
+        (values,), memory = state
+        weight, wide, known = memory[..., :3], memory[..., 3], memory[..., 4]
         at = locate(camera, T_world_cam, jnp.asarray(nodes))
         depth = image.depth[at.row, at.column]
         distance = depth - at.depth
-        seen = at.inside & (depth > 0) & (distance > -band)
-        worth = jnp.where(seen, (depth_sigma(jnp.ones(())) / depth_sigma(depth)) ** 2, 0)
-        surface = jnp.where(jnp.abs(distance) < band, worth, 0)
+        worth = jnp.where(at.inside & (depth > 0), (depth_sigma(jnp.ones(())) / depth_sigma(depth)) ** 2, 0)
+        gain = jnp.stack([
+            jnp.where(distance > -band, worth, 0),
+            jnp.where(jnp.abs(distance) < band, worth, 0),
+            jnp.where(distance > -reach, worth, 0),
+        ], axis=-1)  # fmt: skip
+        total = weight + gain
+        share = gain / jnp.where(total > 0, total, 1)
         rgb = image.rgb[at.row, at.column].astype(values.dtype) / 255
         measured = jnp.concatenate([jnp.minimum(distance, band)[..., None], rgb], axis=-1)
-        gain = jnp.stack([worth, surface, surface, surface], axis=-1)
-        total = weight + gain
-        values = values + gain / jnp.where(total > 0, total, 1) * (measured - values)
-        return MapState((values,), jnp.minimum(total, _MEMORY))
+        values = values + share[..., jnp.array([0, 1, 1, 1])] * (measured - values)
+        wide = wide + share[..., 2] * (jnp.minimum(distance, reach) - wide)
+        known = jnp.where(gain[..., 2] > 0, 1, known)
+        memory = jnp.concatenate([jnp.minimum(total, _MEMORY), wide[..., None], known[..., None]], axis=-1)
+        return MapState((values,), memory)
 
-    return lambda params: MapState(params, jnp.zeros(params[0].shape)), update
+    return lambda params: MapState(params, jnp.zeros((*params[0].shape[:3], 5))), update
+
+
+def look_up(
+    scene: SceneField, config: GridConfig, wide: bool, params: Params, memory: Any, point: Float[Array, "3"]
+) -> Nearby:
+    """A point in a map: by the wide distance in a fused map's memory, or by the scene's own."""
+    distance, rgb = scene.query(params, point, jnp.zeros(3, point.dtype))
+    reach = config.truncation
+    known = jnp.ones_like(distance)
+    if wide:
+        position = (point - jnp.asarray(config.lower, point.dtype)) / config.voxel
+        *_, distance, known = trilinear(memory, position)
+        reach = _REACH * config.voxel
+    measured = (known > 1 - 1e-3) & (jnp.abs(distance) < 0.98 * reach)
+    return Nearby(distance, rgb, measured.astype(distance.dtype))
 
 
 def make_descend(scene: SceneField, camera: Camera, config: MapConfig):

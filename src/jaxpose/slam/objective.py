@@ -21,14 +21,14 @@ class TrackConfig:
     """How one frame is tracked.
 
     `gradient` is the paper's: Adam on the field through the renderer, pixels drawn anew in each iteration.
-    `gauss_newton` first moves the pose itself by second-order steps, then brings the field there
-    (`align.py`).
+    `gauss_newton` first moves the pose itself by second-order steps onto the map's surface, then brings the
+    field there (`align.py`).
     """
 
     method: Literal["gauss_newton", "gradient"] = "gauss_newton"
-    pixels: int = 2500  # 200 to 1000 for `gradient`, which draws new ones in each iteration
+    pixels: int = 5000  # 200 to 1000 for `gradient`, which draws new ones in each iteration
     edge: int = 8  # [px] border left out
-    iterations: int = 15  # at most; 150 for `gradient`
+    iterations: int = 25  # at most; 150 for `gradient`
     patience: int = 30  # of `gradient`: iterations without a lower loss after which to stop
     learning_rate: float = 1e-3  # Adam, of TransNet [per translation_scale]
     rotation_rate: float = 2e-4  # of RotsNet

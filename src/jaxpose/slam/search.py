@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxpose import se3
-from jaxpose.render import Query
+from jaxpose.slam.mapping import Lookup
 from jaxpose.slam.observe import Pixels, back_project
 
 FOUND_SIGMA = (0.04, 0.03)  # [m, rad] how far off the pose that a search finds may be
@@ -17,30 +17,29 @@ _CANDIDATES = 512
 CENTRES = 32  # kept from round to round
 _ROUNDS = 5
 _NARROWER = 0.5  # the spread of a round's candidates against that of the one before
+_FAR = 0.2  # [m] from a surface: no point is worse
 _COLOUR = 0.5  # what a wrong colour costs, against a point that is nowhere near a surface
 _COLOUR_SCALE = 0.3
 _PRIOR = 0.02  # what a sigma along one axis costs
 
 
 def search(
-    query: Query,
+    look_up: Lookup,
     T_world_cam: Float[Array, "k 4 4"],
     sigma: Float[Array, "2"],
     pixels: Pixels,
-    band: float,
     key: PRNGKeyArray,
 ) -> Float[Array, "4 4"]:
     """The pose among those within a few `sigma` [m, rad] of any of `T_world_cam`.
 
     Rounds of random candidates around the best of the round before, each closer than the last. Measured
-    points are to lie on the map's zero, and the pose near the closest of `T_world_cam`; `band` [m] is the
-    largest distance that the map knows.
+    points are to lie on the map's zero, and the pose near the closest of `T_world_cam`.
     """
     axes = jnp.repeat(sigma, 3)
 
     def score(T):
         away = se3.log(se3.compose(se3.inverse(T_world_cam), T[None])) / axes[None]
-        return mismatch(query, T, pixels, band) + _PRIOR * jnp.min(jnp.sum(away**2, axis=-1))
+        return mismatch(look_up, T, pixels) + _PRIOR * jnp.min(jnp.sum(away**2, axis=-1))
 
     def improve(carry, at):
         best, scores = carry
@@ -59,13 +58,12 @@ def search(
     return best[0]
 
 
-def mismatch(query: Query, T_world_cam: Float[Array, "4 4"], pixels: Pixels, band: float) -> Float[Array, ""]:
+def mismatch(look_up: Lookup, T_world_cam: Float[Array, "4 4"], pixels: Pixels) -> Float[Array, ""]:
     """How badly measured points fit the map: distance and colour, 0 to 1.5, a mean over pixels with depth."""
-    points = back_project(pixels, T_world_cam)
-    distance, rgb = jax.vmap(query)(points, pixels.direction_cam)
-    near = jnp.abs(distance) / band
-    colour = jnp.mean(jnp.abs(rgb - pixels.rgb), axis=-1) / _COLOUR_SCALE
-    cost = jnp.where(near < 0.99, near + _COLOUR * jnp.minimum(colour, 1), 1 + _COLOUR)
+    near = jax.vmap(look_up)(back_project(pixels, T_world_cam))
+    off = jnp.minimum(jnp.abs(near.distance) / _FAR, 1)
+    colour = jnp.mean(jnp.abs(near.rgb - pixels.rgb), axis=-1) / _COLOUR_SCALE
+    cost = jnp.where(near.known > 0, off + _COLOUR * jnp.minimum(colour, 1), 1 + _COLOUR)
     seen = (pixels.depth > 0).astype(cost.dtype)
     return jnp.sum(cost * seen) / jnp.maximum(jnp.sum(seen), 1)
 

@@ -8,7 +8,7 @@ it reads are compositions on top, `slam/frames.py`.
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +22,7 @@ from jaxpose.imu import ResidualSigmas
 from jaxpose.scenes import SceneField
 from jaxpose.slam.align import align, best_start, pose_sigma, starts
 from jaxpose.slam.frames import Framed, Gauge, Motion
+from jaxpose.slam.mapping import Nearby
 from jaxpose.slam.objective import ImuWeights, TrackConfig, image_loss, image_residuals, imu_loss
 from jaxpose.slam.observe import sample_pixels
 from jaxpose.slam.predict import AHEAD, Interval
@@ -90,24 +91,26 @@ def make_settle(framed: Framed, config: TrackConfig, weights: ImuWeights, sigmas
 
 def make_track(
     scene: SceneField,
+    look_up: Callable[[Params, Any, Float[Array, "3"]], Nearby],
     camera: Camera,
     T_body_cam: Float[Array, "4 4"],
     config: TrackConfig,
     settle: Settle,
 ):
-    """The step `track(scene_params, params, T_world_ref, gauge, interval, image, far, key) -> Tracked`.
+    """The step `track(scene_params, memory, params, T_world_ref, gauge, interval, image, far, key)`.
 
-    Its inner loops are compiled; the field starts from its own parameters `params`.
+    It returns `Tracked`. `look_up(scene_params, memory, point)` is the map as alignment reads it. Its inner
+    loops are compiled; the field starts from its own parameters `params`.
     """
 
     @jax.jit
-    def aligned(scene_params, T_world_ref, interval, image, far, key):
-        query = partial(scene.query, scene_params)
+    def aligned(scene_params, memory, T_world_ref, interval, image, key):
+        look = partial(look_up, scene_params, memory)
         pixels = sample_pixels(key, image, camera, config.pixels, edge=config.edge)
         tries = starts(interval.T_ref_body[AHEAD - 1], interval.sigma)
         T_world_tries = se3.compose(T_world_ref, se3.compose(tries, T_body_cam))
-        start = best_start(query, T_world_tries, pixels, far, config)
-        found = align(query, start, T_world_tries[0], interval.sigma, pixels, far, config)
+        start = best_start(look, T_world_tries, pixels)
+        found = align(look, start, T_world_tries[0], interval.sigma, pixels, config)
         T_world_body = se3.compose(found.T_world_cam, se3.inverse(T_body_cam))
         seen = (
             found.loss,
@@ -118,12 +121,14 @@ def make_track(
         )
         return se3.compose(se3.inverse(T_world_ref), T_world_body), seen
 
-    def gauss_newton(scene_params, params, T_world_ref, gauge, interval, image, far, key):
-        T_ref_body, seen = aligned(scene_params, T_world_ref, interval, image, far, key)
+    def gauss_newton(scene_params, memory, params, T_world_ref, gauge, interval, image, far, key):
+        del far  # nothing is rendered
+        T_ref_body, seen = aligned(scene_params, memory, T_world_ref, interval, image, key)
         return Tracked(*settle.pinned(params, gauge, interval, T_ref_body), *seen)
 
     @jax.jit
-    def gradient(scene_params, params, T_world_ref, gauge, interval, image, far, key):
+    def gradient(scene_params, memory, params, T_world_ref, gauge, interval, image, far, key):
+        del memory
         params = settle.bring(params, gauge, interval)
         query = partial(scene.query, scene_params)
 

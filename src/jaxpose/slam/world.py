@@ -15,7 +15,7 @@ from jaxpose.scenes import GridConfig, SceneField, box, grid, grow, merge
 from jaxpose.scenes.base import Params
 from jaxpose.slam.config import SlamConfig
 from jaxpose.slam.keyframes import choose, overlap, read_keyframes
-from jaxpose.slam.mapping import MapState, make_descend, make_fuse
+from jaxpose.slam.mapping import MapState, look_up, make_descend, make_fuse
 from jaxpose.slam.observe import Image, sample_pixels
 from jaxpose.slam.search import search as find
 from jaxpose.slam.state import SlamState
@@ -45,13 +45,14 @@ def make_world(recording: Recording, config: SlamConfig, settle: Settle, size: G
         init_map, update = make_descend(scene, recording.camera, map_config)
     track_config = replace(config.track, sample=replace(config.track.sample, **scale))
     T_body_cam = jnp.asarray(recording.T_body_cam, jnp.float32)
-    track = make_track(scene, recording.camera, T_body_cam, track_config, settle)
+    look = partial(look_up, scene, size, config.map.method == "fused")
+    track = make_track(scene, look, recording.camera, T_body_cam, track_config, settle)
 
     @jax.jit
-    def search(scene_params, T_world_cam, sigma, image, key):
+    def search(scene_params, memory, T_world_cam, sigma, image, key):
         pixel_key, key = jax.random.split(key)
         pixels = sample_pixels(pixel_key, image, recording.camera, _LOOKED_AT, edge=config.track.edge)
-        return find(partial(scene.query, scene_params), T_world_cam, sigma, pixels, size.truncation, key)
+        return find(partial(look, scene_params, memory), T_world_cam, sigma, pixels, key)
 
     return World(scene, lambda: init_map(scene.init(jax.random.key(0))), search, track, update)
 

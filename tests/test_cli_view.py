@@ -1,0 +1,406 @@
+"""`jaxpose view`: what a scene holds, what a saved page plays, wrong calls; the page in a browser (slow)."""
+
+import base64
+import io as std_io
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+
+import jax.numpy as jnp
+import msgspec
+import numpy as np
+import pytest
+import trimesh
+import zstandard
+from PIL import Image
+
+from jaxpose import cli, io, io_field
+from jaxpose.camera import Camera
+from jaxpose.commands import view, view_page
+from jaxpose.commands.view import Config
+from jaxpose.commands.view_scene import WIDTH, read_scene, up_direction
+from jaxpose.errors import DataError
+from jaxpose.experiments.slam_map import SavedMap, write_map
+from jaxpose.io_camera import write_camera
+from jaxpose.io_ply import write_ply
+from jaxpose.scenes import GridConfig
+
+COUNT, LAST, FIRST, SPEED = 9, 2.0, 5.0, 0.3  # frames, span [s], first stamp [s], along x [m/s]
+CAMERA = Camera(100.0, 100.0, 79.5, 59.5, 160, 120)
+WALL = 1.5  # [m] along z; red where x < 0.1, blue beyond
+RED, BLUE = (255, 0, 0), (0, 0, 255)
+
+
+def poses_at(t):
+    T = np.tile(np.eye(4), (len(t), 1, 1))
+    T[:, 0, 3] = SPEED * np.asarray(t)
+    return T
+
+
+@pytest.fixture
+def run(tmp_path):
+    """What a SLAM run leaves: a camera that slides along a wall of two colours, stamps from 5 s on."""
+    folder = tmp_path / "run"
+    folder.mkdir()
+    span, intervals = (FIRST, FIRST + LAST), 4
+    points = np.zeros((intervals + 3, 7))
+    points[:, 0] = SPEED * (np.arange(intervals + 3) - 1) * LAST / intervals
+    io_field.write_field(folder / "field.npz", span, [io_field.bspline_factor(span, jnp.asarray(points))])
+    t = np.linspace(0, LAST, COUNT)
+    io.write_tum(folder / "trajectory.txt", io.Trajectory(FIRST + t, poses_at(t)))
+    truth = poses_at(t)
+    truth[:, 1, 3] = 0.01
+    io.write_tum(folder / "reference.txt", io.Trajectory(FIRST + t, truth))
+    names = tuple(f"{k}.png" for k in range(COUNT))
+    for k, name in enumerate(names):
+        Image.new("RGB", (320, 240), (k, 0, 0)).save(folder / name)
+    write_camera(folder / "camera.json", CAMERA, names, ".")
+    grid = GridConfig((-2.0, -2.0, -0.4), (2.4, 2.0, 2.0), 0.1, 1, 0.3)
+    x, _, z = np.meshgrid(*(np.arange(n) for n in (45, 41, 25)), indexing="ij")
+    values = np.zeros((45, 41, 25, 4), np.float32)
+    values[..., 0] = np.clip(WALL - (grid.lower[2] + 0.1 * z), -0.3, 0.3)
+    left = grid.lower[0] + 0.1 * x < 0.1
+    values[..., 1], values[..., 3] = left, ~left
+    write_map(folder / "map.npz", SavedMap(grid, values, np.array([0, 4])))
+    corners = np.array([[-1, -1, WALL], [1, -1, WALL], [1, 1, WALL]])
+    write_ply(folder / "mesh.ply", corners, np.full((3, 3), 200, np.uint8), np.array([[0, 2, 1]]))
+    io.write_json(folder / "results.json", {"experiment": "rgbd_slam"})
+    return folder
+
+
+def test_what_a_scene_holds(run):
+    scene = read_scene(run, 5)
+    assert scene.notes == () and "rgbd_slam run, 9 poses" in scene.name
+    np.testing.assert_allclose(scene.t, np.linspace(0, LAST, COUNT), atol=1e-9)
+    steps = np.linspace(0, LAST, len(scene.path))
+    np.testing.assert_allclose(scene.path, poses_at(steps)[:, :3, 3], atol=1e-6)
+    assert len(scene.path) > 5 * COUNT  # the field's, not a polygon of the frames
+    np.testing.assert_allclose(scene.reference[:, :2], np.stack([SPEED * scene.t, np.full(9, 0.01)], 1))
+    np.testing.assert_allclose(scene.keyframes, poses_at(scene.t[[0, 4]])[:, :3, 3], atol=1e-9)
+    assert [shot.t for shot in scene.shots] == pytest.approx([0, 0.5, 1, 1.5, 2])
+    for k, shot in zip((0, 2, 4, 6, 8), scene.shots, strict=True):  # each image holds its number
+        assert shot.rgb.shape == (120, WIDTH, 3) and (shot.rgb == (k, 0, 0)).all()
+        np.testing.assert_allclose(shot.T_world_cam, poses_at([shot.t])[0], atol=1e-9)
+    assert scene.surface == run / "mesh.ply" and scene.camera == CAMERA
+    np.testing.assert_array_equal(scene.up, [0, -1, 0])
+
+
+@pytest.mark.parametrize("t", [0.0, 0.77, 2.0])
+def test_a_render_is_what_the_camera_sees_at_that_time(run, t):
+    picture = read_scene(run, 0).render(t, WIDTH)
+    assert picture.shape == (120, 160, 3)
+    # Colours of the grid pass from the node at x = 0 to that at 0.1: half of either at 0.05.
+    border = CAMERA.cx + CAMERA.fx * (0.05 - SPEED * t) / WALL
+    columns = np.arange(160)
+    assert border > 20
+    assert np.abs(picture[:, columns < border - 10].astype(int) - RED).max() < 3
+    assert np.abs(picture[:, columns > border + 10].astype(int) - BLUE).max() < 3
+    row = picture[60].astype(int)
+    assert np.argmax(row[:, 2] > row[:, 0]) == pytest.approx(border, abs=1)
+
+
+def test_what_is_not_there_is_noted(run):
+    (run / "3.png").unlink()
+    scene = read_scene(run, 2)
+    assert [shot.rgb.shape for shot in scene.shots] == [(60, 80, 3)] * 2  # renders
+    assert "not all images" in scene.notes[0] and "frustums show renders" in scene.notes[1]
+    for name in ("map.npz", "mesh.ply", "reference.txt"):
+        (run / name).unlink()
+    scene = read_scene(run, 2)
+    assert scene.render is None and scene.shots[0].rgb is None and scene.surface is None
+    assert len(scene.keyframes) == 0 and scene.reference is None
+    assert "no renders" in scene.notes[1]
+    (run / "field.npz").unlink()
+    (run / "camera.json").unlink()
+    scene = read_scene(run, 2)
+    assert "no field.npz" in scene.notes[0] and "no camera.json" in scene.notes[1]
+    np.testing.assert_allclose(scene.poses(np.array([0.9, 1.1])), poses_at([1, 1]))  # 0.75, 1, 1.25, 2
+
+
+def test_a_trajectory_file(run):
+    scene = read_scene(run / "trajectory.txt", 3)
+    assert len(scene.path) == COUNT and len(scene.shots) == 3 and scene.render is None
+
+
+def test_a_truth_in_a_world_of_its_own(run):
+    """It begins after the run: the run could not start from it."""
+    t = np.linspace(0, LAST, COUNT)[2:]
+    T = np.diag([-1.0, -1.0, 1.0, 1.0]) @ poses_at(t) + 0.0
+    T[:, 1, 3] = 7 + 0.1 * t**2
+    moved = poses_at(t)
+    moved[:, 1, 3] = -0.1 * t**2
+    io.write_tum(run / "reference.txt", io.Trajectory(FIRST + t, T))
+    scene = read_scene(run, 0)
+    assert "moved onto the estimate" in " ".join(scene.notes)
+    distance = np.linalg.norm(np.diff(scene.reference, axis=0), axis=1)
+    np.testing.assert_allclose(distance, np.linalg.norm(np.diff(moved[:, :3, 3], axis=0), axis=1), atol=1e-9)
+    assert np.abs(scene.reference - poses_at(t)[:, :3, 3]).max() < 0.2
+
+
+def test_the_overview_has_the_path_before_it(run):
+    scene = read_scene(run, 0)
+    wall = np.random.default_rng(0).uniform([-1, -1, WALL], [1, 1, WALL], (500, 3))
+    eye, centre, size = view_page.overview(scene, wall)
+    assert eye[2] < 0 and eye[1] < centre[1]  # behind the cameras, which look along z, and above: up is -y
+    forward = (centre - eye) / np.linalg.norm(centre - eye)
+    away = np.concatenate([scene.path, wall]) - eye
+    angle = np.arccos(away @ forward / np.linalg.norm(away, axis=1))
+    assert np.degrees(angle).max() < 75 / 2  # half of viser's field of view
+
+
+def test_up_is_where_upright_cameras_say():
+    down = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # x right, image down is -z: z is up
+    T = np.tile(np.eye(4), (2, 1, 1))
+    T[:, :3, :3] = down
+    np.testing.assert_array_equal(up_direction(T), [0, 0, 1])
+    T[:, :3, :3] = trimesh.transformations.rotation_matrix(0.7, [1, 0, 0])[:3, :3] @ down
+    np.testing.assert_allclose(up_direction(T), [0, -np.sin(0.7), np.cos(0.7)])
+
+
+def played(file):
+    """Seconds and messages of a saved page, as viser's own client would read them."""
+    page = file.read_text()
+    data = base64.b64decode(re.search(r'window.__VISER_EMBED_DATA__="([^"]*)"', page)[1])
+    content = zstandard.ZstdDecompressor().decompressobj().decompress(data[8:])
+    size = int.from_bytes(content[:8], "little")
+    told = msgspec.msgpack.decode(content[8 : 8 + size])
+    return page, told["durationSeconds"], told["messages"]
+
+
+def test_a_saved_page_plays_the_way_of_the_camera(run, tmp_path, capsys):
+    out = tmp_path / "new" / "page.html"
+    cli.main(["view", str(run), "--save", str(out), "--frustums", "4"])
+    told = capsys.readouterr()
+    assert str(out) in told.out and "opens in any browser" in told.out and told.err == ""
+    page, duration, messages = played(out)
+    assert not re.search(r'<(script|link)[^>]*(src|href)="http', page)
+    assert duration == pytest.approx(LAST)
+    made = {
+        message["name"]
+        for _, message in messages
+        if message["type"].endswith("Message") and "name" in message
+    }
+    assert {"/estimate", "/truth", "/keyframes", "/camera", "/map"} <= made
+    assert sum(name.startswith("/frames/") for name in made) == 4
+    told = [(t, message) for t, message in messages if message.get("name") == "/camera"]
+    way = np.array([(t, *message["position"]) for t, message in told if "position" in message])
+    assert len(way) >= 30 and way[-1, 0] == pytest.approx(LAST)
+    np.testing.assert_allclose(way[:, 1:], poses_at(way[:, 0])[:, :3, 3], atol=1e-5)
+    pictures = [(t, message["updates"]["_image_data"]) for t, message in told if "updates" in message]
+    for t, data in (pictures[0], pictures[len(pictures) // 2], pictures[-1]):
+        np.testing.assert_array_equal(Image.open(std_io.BytesIO(data)), read_scene(run, 0).render(t, WIDTH))
+
+
+def test_the_last_value_asked_for_is_worked_on():
+    begun, go, done = threading.Event(), threading.Event(), []
+
+    def work(value):
+        begun.set()
+        go.wait(10)
+        done.append(value)
+
+    ask, stop = view_page.latest(work)
+    ask(1.0)
+    assert begun.wait(10)
+    for value in (2.0, 3.0, 4.0):
+        ask(value)
+    go.set()
+    for _ in range(1000):
+        if len(done) == 2:
+            break
+        time.sleep(0.01)
+    stop()
+    assert done == [1.0, 4.0]
+
+
+def test_a_port_that_is_taken(run):
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        shown = view.run(Config(run, port=port, frustums=0))
+        try:
+            url = shown.url
+            assert url.startswith("http://localhost:") and not url.endswith(f":{port}")
+            assert f"port {port} is taken" in view.report(shown)
+            with socket.create_connection(("127.0.0.1", int(url.split(":")[-1])), timeout=10):
+                pass
+        finally:
+            shown.close()
+
+
+def complaint(*args) -> str:
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["view", *(str(arg) for arg in args)])
+    assert isinstance(stop.value.code, str) and "\n" not in stop.value.code
+    return stop.value.code
+
+
+def test_wrong_calls_cost_one_line(run, tmp_path):
+    (tmp_path / "empty").mkdir()
+    assert complaint(tmp_path / "empty").startswith("jaxpose view: ")
+    assert "expected a run folder with trajectory.txt" in complaint(tmp_path / "empty")
+    assert "runs in it: run" in complaint(tmp_path)
+    assert "got nothing" in complaint(tmp_path / "none")
+    assert "--save: expected a name that ends in .html" in complaint(run, "--save", "x.viser")
+    assert "--port: expected" in complaint(run, "--port", "65536")
+    assert "--frustums: expected" in complaint(run, "--frustums", "-1")
+    (run / "mesh.ply").write_text("no mesh")
+    assert "mesh.ply: expected a PLY" in complaint(run, "--frustums", "0")
+    (run / "map.npz").write_text("no map")
+    assert "map.npz: expected a map" in complaint(run)
+
+
+def test_a_map_of_another_kind(run):
+    with np.load(run / "map.npz") as file:
+        content = dict(file)
+    np.savez(run / "map.npz", **(content | {"version": 2}))
+    with pytest.raises(DataError, match="map.npz: expected a map of version 1, got 2"):
+        read_scene(run, 0)
+    np.savez(run / "map.npz", **(content | {"keyframes": np.array([0, 9])}))
+    with pytest.raises(DataError, match="map.npz: expected keyframes below 9, got 9"):
+        read_scene(run, 0)
+
+
+def test_without_the_extra(run, monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    monkeypatch.delitem(sys.modules, "jaxpose.commands.view_page")
+    monkeypatch.delattr("jaxpose.commands.view_page")
+    assert complaint(run) == 'jaxpose view: expected viser, got none: pip install "jaxpose[viewer]"'
+
+
+def test_help(capsys):
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["view", "--help"])
+    assert not stop.value.code
+    told = capsys.readouterr().out
+    for word in ("RUN", "--port", "--save", "--frustums", "slider"):
+        assert word in told
+
+
+# --- in a browser -------------------------------------------------------------------------------------------
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+# WebGL without a graphics card, and a sandbox that root may not have.
+FLAGS = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+SIZE, PANEL = (1280, 800), 940  # [px] the page, and where its panel begins
+PICTURE = "img[src^='blob:'], img[src^='data:image/png']"
+
+
+@pytest.fixture(scope="module")
+def browser():
+    playwright = pytest.importorskip("playwright.sync_api", reason='needs pip install "jaxpose[viewer-test]"')
+    found = next((path for path in map(shutil.which, BROWSERS) if path), None)
+    if found is None:
+        pytest.skip(f"needs a browser: none of {', '.join(BROWSERS)} is installed")
+    with playwright.sync_playwright() as p:
+        browser = p.chromium.launch(executable_path=found, args=FLAGS)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="module", params=["rgbd_slam", "noisy_nerf", "event_nerf"])
+def smoke_run(request, tmp_path_factory):
+    """A run of seconds, by the command itself."""
+    out = tmp_path_factory.mktemp("runs") / request.param
+    command = [sys.executable, "-m", f"jaxpose.experiments.{request.param}", "--smoke", "--out", str(out)]
+    subprocess.run(command, check=True, capture_output=True)
+    return out
+
+
+@pytest.fixture
+def address(smoke_run):
+    """Where the viewer shows the run; Ctrl-C then ends it without a word."""
+    command = [sys.executable, "-m", "jaxpose", "view", str(smoke_run), "--port", "0", "--frustums", "3"]
+    viewer = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        yield viewer.stdout.readline().split()[0]
+        viewer.send_signal(signal.SIGINT)
+        assert viewer.wait(20) == 0 and viewer.stderr.read() == ""
+    finally:
+        viewer.kill()
+
+
+def pixels(png):
+    return np.asarray(Image.open(std_io.BytesIO(png)).convert("RGB"))
+
+
+def shown_picture(page):
+    """The render in the panel, as the browser has it."""
+    read = """async image => {
+        const bytes = new Uint8Array(await (await fetch(image.src)).arrayBuffer());
+        return Array.from(bytes);
+    }"""
+    return pixels(bytes(page.locator(PICTURE).evaluate(read)))
+
+
+def until(condition, seconds=60):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.2)
+
+
+def to_green(screenshot, place):
+    """Distance [px] from a row and column to the nearest pixel of the camera's frustum, by its colour."""
+    r, g, b = np.moveaxis(screenshot[:, :PANEL].astype(int), -1, 0)
+    found = np.argwhere((g > r + 30) & (g > b + 30))
+    assert len(found) > 100
+    return np.linalg.norm(found - place, axis=1).min()
+
+
+def on_screen(scene, points):
+    """Row and column of points, from where the page is looked at first (field of view 75 degrees)."""
+    surface = trimesh.load(scene.surface, process=False).vertices if scene.surface else scene.path[:0]
+    eye, centre, _ = view_page.overview(scene, np.asarray(surface))
+    forward = centre - eye
+    forward = forward / np.linalg.norm(forward)
+    right = np.cross(forward, scene.up)
+    right = right / np.linalg.norm(right)
+    away = points - eye
+    scale = SIZE[1] / 2 / np.tan(np.radians(75) / 2) / (away @ forward)
+    row = SIZE[1] / 2 - scale * (away @ np.cross(right, forward))
+    return np.stack([row, SIZE[0] / 2 + scale * (away @ right)], axis=-1)
+
+
+@pytest.mark.slow
+def test_the_slider_moves_the_camera_and_shows_the_render_of_its_time(browser, address, smoke_run):
+    scene = read_scene(smoke_run, 0)
+    last = float(scene.t[-1])
+    page = browser.new_page(viewport={"width": SIZE[0], "height": SIZE[1]})
+    asked = []
+    page.on("request", lambda request: asked.append(request.url))
+    page.goto(address)
+    page.wait_for_selector("canvas")
+    page.wait_for_selector(PICTURE)
+    np.testing.assert_array_equal(shown_picture(page), scene.render(0.0, WIDTH))
+    switches = page.get_by_role("checkbox").first.bounding_box()
+    for label in ("estimate (blue)", "frames", "map"):  # what may hide the camera or be as green
+        text = page.get_by_text(label, exact=True)
+        if text.count():
+            box = text.bounding_box()
+            page.mouse.click(switches["x"] + switches["width"] / 2, box["y"] + box["height"] / 2)
+    time.sleep(5)
+    before = pixels(page.screenshot())
+    value = round(0.7 * last, 2)
+    field = page.locator("input[inputmode]").first
+    field.fill(str(value))
+    field.press("Enter")
+    expected = scene.render(value, WIDTH)
+    assert (expected != scene.render(0.0, WIDTH)).any()
+    until(lambda: np.array_equal(shown_picture(page), expected))
+    time.sleep(5)
+    after = pixels(page.screenshot())
+    # Where the tip of its frustum has to be, before and after: there it is, and not at the other time.
+    first, then = on_screen(scene, scene.poses(np.array([0, value]))[:, :3, 3])
+    assert np.linalg.norm(first - then) > 20
+    there = to_green(before, first), to_green(after, then)
+    elsewhere = to_green(before, then), to_green(after, first)
+    assert max(there) < 8 and min(elsewhere) > 12, (there, elsewhere)
+    here = ("data:", "blob:", address)
+    assert [url for url in asked if not url.startswith(here)] == []  # nothing from the network
