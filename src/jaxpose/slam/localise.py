@@ -30,7 +30,7 @@ from jaxpose.slam.world import scene_params
 _HELD = 0.08  # [m, rad] a prediction from the IMU that cannot be off by more is as good as no loss
 _FARTHEST = 0.5  # [m, rad]
 _AROUND_CENTRES = 0.25  # [m, rad] a search reaches where nothing else is known
-# After a loss: share explained, and loss against the usual, of a camera that could be anywhere, or not far off.
+# After a loss, share explained and loss against the usual: of a camera that could be anywhere, or is near.
 _RECOGNISED = 0.7, 1.1
 _FOUND_AGAIN = 0.5, 1.3
 _RECKONED = 0.3  # [m, rad] a pose from the IMU alone is good enough to go on from
@@ -60,15 +60,15 @@ def next_pose(
     if np.mean(frame.depth > 0) < _LEAST_DEPTH:
         return _moved(system, state, state.frames, dt, readings, predicted, None, lost=True)
     frames, tracked, lost = state.frames, None, True
-    for wide, key in zip((False, True), jax.random.split(key), strict=True):
+    for wide, try_key in zip((False, True), jax.random.split(key), strict=True):
         if wide:
-            frames, T_ref_body = _searched(system, state, frame, image, predicted, reach, key)
+            frames, T_ref_body = _searched(system, state, frame, image, predicted, reach, try_key)
             twist = np.asarray(se3.log(jnp.asarray(T_ref_body, jnp.float32)))
             stamps = dt * np.arange(1, len(stamps) + 1) / len(stamps)
             poses = np.asarray(se3.exp(jnp.asarray(stamps[:, None] / dt * twist, jnp.float32)), np.float64)
             sigma = np.minimum(sigma, FOUND_SIGMA)
         interval = _interval(system, frames, i - 1, dt, stamps, poses, sigma, readings)
-        tracked = _track(system, state, frames, interval, image, generator, key)
+        tracked = _track(system, state, frames, interval, image, generator, try_key)
         lost = _failed(system, state, tracked, reach)
         if not lost:
             break
