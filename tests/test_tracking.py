@@ -18,10 +18,12 @@ from jaxpose.slam.mapping import Nearby
 from jaxpose.slam.objective import TrackConfig
 from jaxpose.slam.observe import Pixels
 from jaxpose.slam.predict import (
+    GYRO_BIAS_SIGMA,
     end_velocity,
     integrate,
     no_readings,
     observe_acceleration,
+    observe_gyro_bias,
     predict,
     prediction_sigma,
 )
@@ -193,11 +195,28 @@ def test_a_false_acceleration_is_found_from_the_errors_of_predictions():
     assert np.abs(observe_acceleration(np.zeros(3), 0.033, np.array([1e-3, 0, 0]))).max() < 1e-3
 
 
+def test_the_bias_of_a_gyroscope_is_found_from_the_errors_of_predictions():
+    true, bias, sigma, t = np.array([0.02, -0.05, 0.08]), np.zeros(3), GYRO_BIAS_SIGMA, 0.2
+    rng, sigmas = np.random.default_rng(0), []
+    for _ in range(50):
+        # Predicted with a rate that is too large by what is left of the bias.
+        error = Rotation.from_rotvec((bias - true) * t + 0.003 * rng.normal(size=3))
+        bias, sigma = observe_gyro_bias(bias, sigma, t, error.as_matrix())
+        sigmas.append(sigma)
+    assert sigmas[0] < 0.016 and sigmas == sorted(sigmas, reverse=True)
+    assert np.abs(bias - true).max() < 3 * sigma < 0.02
+    # Over 30 ms a turn off by 0.1 degrees says little once the bias is known.
+    late, _ = observe_gyro_bias(bias, 1e-3, 0.033, Rotation.from_rotvec([0.002, 0, 0]).as_matrix())
+    assert np.abs(late - bias).max() < 1e-3
+
+
 def test_a_gyroscope_makes_predictions_sharper():
     motion = np.asarray(se3.exp(jnp.array([0.1, 0.0, 0.0, 0.0, 0.3, 0.0])))
     alone = prediction_sigma(0.5, motion, rotation=False, speed=False)
     gyro = prediction_sigma(0.5, motion, rotation=True, speed=False)
     both = prediction_sigma(0.5, motion, rotation=True, speed=True)
+    biased = prediction_sigma(0.5, motion, rotation=True, speed=True, gyro_bias_sigma=0.1)
+    assert biased[1] == pytest.approx(both[1] + 0.05)
     assert gyro[1] < alone[1] and gyro[0] == alone[0] and both[0] < gyro[0]
 
 

@@ -2,7 +2,7 @@
 
 import zipfile
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -28,7 +28,7 @@ def save(path: Path | str, state: SlamState) -> None:
     """Write a run's state, whole or not at all."""
     size = state.grid
     box = _Box(*(np.asarray(getattr(size, name)) for name in _Box._fields))
-    io_checkpoint.save(path, state._replace(done=np.asarray(state.done), far=np.asarray(state.far), grid=box))
+    io_checkpoint.save(path, _as_arrays(state, box))
 
 
 def load(path: Path | str, system: System) -> SlamState:
@@ -48,6 +48,12 @@ def load(path: Path | str, system: System) -> SlamState:
         int(box.levels),
         float(box.truncation),
     )
-    like = begin(system, size)._replace(done=np.asarray(0), far=np.asarray(0.0), grid=box)
-    state = io_checkpoint.load(path, like)
-    return state._replace(done=int(state.done), far=float(state.far), grid=size)
+    state = io_checkpoint.load(path, _as_arrays(begin(system, size), box))
+    return state._replace(
+        done=int(state.done), far=float(state.far), gyro_bias_sigma=float(state.gyro_bias_sigma), grid=size
+    )
+
+
+def _as_arrays(state: SlamState, box: _Box) -> Any:
+    numbers = {name: np.asarray(getattr(state, name)) for name in ("done", "far", "gyro_bias_sigma")}
+    return state._replace(**numbers, grid=box)

@@ -14,14 +14,17 @@ import tyro
 from jaxpose import io
 from jaxpose.data import recordings
 from jaxpose.data.synthetic import RoomConfig, room
+from jaxpose.ekf import PoseNoise
 from jaxpose.errors import DataError
 from jaxpose.imu import ADIS16448, QUIET, Imu, ImuNoise
+from jaxpose.imu_filter import filter_imu
 from jaxpose.imu_simulation import simulate_from_poses
 from jaxpose.recording import Recording, select, thin
 from jaxpose.slam.run import SlamConfig
 
 SIMULATED_HZ = 200.0  # of the IMU made for recordings that have none (METHOD section 5)
 SMOKE_FRAMES = 8
+_POSE_NOISE = PoseNoise(1e-3, 2e-3)  # [m, rad] what motion capture is good for
 FEWEST_FRAMES = 3  # three camera centres are the fewest that an alignment can be wrong about
 
 
@@ -37,6 +40,8 @@ class Options:
     frames: int | None = None  # how many frames from there, counted before thinning; None: all
     # How rotations pass through the true poses where an IMU is simulated from them: slerp is the paper's.
     imu_rotation: Literal["slerp", "spline"] = "slerp"
+    imu_offset_s: float = 0.0  # added to the stamps of a recording's own IMU [s]
+    imu_filter: bool = False  # take off that IMU's biases with the help of the true poses, as the paper does
     compare: bool = False  # run all IMU modes and put them side by side
     resume: bool = False  # go on where a run of the same folder and settings was stopped
     smoke: bool = False  # everything shrunk to seconds; the numbers then mean nothing
@@ -50,6 +55,8 @@ class Options:
             value = getattr(self, option)
             if value is not None and not 0 < value < math.inf:
                 raise ValueError(f"--{option.replace('_', '-')}: expected a positive number, got {value}")
+        if not math.isfinite(self.imu_offset_s):
+            raise ValueError(f"--imu-offset-s: expected a finite number, got {self.imu_offset_s}")
         if self.start < 0:
             raise ValueError(f"--start: expected 0 or more, got {self.start}")
         if self.frames is not None and self.frames < FEWEST_FRAMES:
@@ -101,24 +108,27 @@ def load(options: Options) -> Source:
     An IMU is simulated from the truth before frames are thinned, unless the recording has its own. Time
     starts at the first frame used. Raises DataError or OSError for what cannot be used.
     """
-    name, own_imu = "room", False
+    own_imu = options.room.along is not None
     if options.data is None:
-        recording = room(_room_config(options))
+        name, recording = "room", room(_room_config(options))
         noise = options.room.imu_noise
         imu = f"{options.room.imu_rate_hz:g} Hz, exact derivatives of the room's path, {_sheet(noise)}"
     else:
         name = recordings.find_format(options.data) if options.format in ("room", None) else options.format
         recording = recordings.load(options.data, name, rate_hz=options.recorded_hz)
         imu, own_imu = "none", recording.imu is not None
-        if recording.imu is not None:
-            imu = f"{1 / float(np.median(np.diff(recording.imu.t))):.3g} Hz, the recording's own, as read"
-        elif options.compare or options.slam.imu != "none":
+        if not own_imu and (options.compare or options.slam.imu != "none"):
             recording = recording._replace(imu=_simulated(recording, options))
             imu = (
                 f"simulated at {SIMULATED_HZ:g} Hz from the truth before thinning (cubic spline positions, "
                 f"{options.imu_rotation} rotations, gravity along -z of the truth's frame), "
                 f"{_sheet(options.slam.imu_noise)}, seed {options.slam.seed}"
             )
+    if own_imu:
+        recording, imu = _own_readings(recording, options)
+    elif options.imu_filter or options.imu_offset_s:
+        option = "--imu-filter" if options.imu_filter else "--imu-offset-s"
+        raise DataError(f"{recording.name}: {option} expected a recording with its own IMU, got none")
     recorded = len(recording.t)
     recording = _cut(recording, options)
     if own_imu:
@@ -149,6 +159,42 @@ def _sheet(noise: ImuNoise) -> str:
     if noise == QUIET:
         return "no noise"
     return "ADIS16448's noise" if noise == ADIS16448 else f"noise {noise}"
+
+
+def _own_readings(recording: Recording, options: Options) -> tuple[Recording, str]:
+    """The recording with its own readings as they are to be used, and what they are in words."""
+    imu = recording.imu
+    assert imu is not None
+    imu = imu._replace(t=np.asarray(imu.t) + options.imu_offset_s)
+    what = f"{1 / float(np.median(np.diff(imu.t))):.3g} Hz, the recording's own, as read"
+    if options.imu_offset_s:
+        what += f", {options.imu_offset_s:+g} s"
+    if options.imu_filter:
+        imu = _unbiased(recording, imu, options)
+        what += ", less the biases that a Kalman filter finds on the true poses"
+    return recording._replace(imu=imu), what
+
+
+def _unbiased(recording: Recording, imu: Imu, options: Options) -> Imu:
+    """Readings less their biases by the error-state filter on the true poses (paper section 4.3)."""
+    if recording.T_world_cam is None:
+        raise DataError(f"{recording.name}: --imu-filter expected true poses, got none")
+    truth = recording.T_world_cam @ np.linalg.inv(recording.T_body_cam)
+    with jax.enable_x64(True):
+        found = filter_imu(
+            imu,
+            recording.t,
+            truth,
+            options.slam.imu_noise,
+            _POSE_NOISE,
+            gravity_world=tuple(recording.gravity_world.tolist()),
+        )
+    known = np.isfinite(found.gyro_bias).all(axis=1)
+    return Imu(
+        found.t[known],
+        np.asarray(imu.omega_body)[known] - found.gyro_bias[known],
+        np.asarray(imu.acceleration_body)[known] - found.accelerometer_bias[known],
+    )
 
 
 def _simulated(recording: Recording, options: Options) -> Imu:

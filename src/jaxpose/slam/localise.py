@@ -18,6 +18,7 @@ from jaxpose.slam.predict import (
     Readings,
     end_velocity,
     observe_acceleration,
+    observe_gyro_bias,
     predict,
     prediction_sigma,
 )
@@ -50,12 +51,14 @@ def next_pose(
     """The state with the next frame's pose: tracked, or predicted and marked as lost."""
     config, t, i = system.config, system.recording.t, state.done
     dt = float(t[i] - t[i - 1])
-    readings = system.readings(i - 1, state.frames.T_world_body[i - 1], state.false_acceleration)
+    readings = system.readings(
+        i - 1, state.frames.T_world_body[i - 1], state.gyro_bias, state.false_acceleration
+    )
     stamps, poses = predict(
         dt, state.twist, state.velocity_body, readings,
         rotation=config.senses_rotation, speed=config.senses_speed,
     )  # fmt: skip
-    predicted, sigma = poses[-1], _sigma(config, dt, poses[-1], first=i == 1)
+    predicted, sigma = poses[-1], _sigma(config, state, dt, poses[-1])
     reach = _reach(system, state, sigma, dt)
     if np.mean(frame.depth > 0) < _LEAST_DEPTH:
         return _moved(system, state, state.frames, dt, readings, predicted, None, lost=True)
@@ -104,6 +107,10 @@ def _moved(
     ):  # else the speed is not known
         error = T_world_ref[:3, :3] @ (T_ref_body[:3, 3] - predicted[:3, 3])
         false_acceleration = observe_acceleration(false_acceleration, dt, error)
+    gyro_bias, gyro_bias_sigma = state.gyro_bias, state.gyro_bias_sigma
+    if config.senses_rotation and tracked is not None and not lost and not frames.lost[i - 1]:
+        off = predicted[:3, :3].T @ T_ref_body[:3, :3]
+        gyro_bias, gyro_bias_sigma = observe_gyro_bias(gyro_bias, gyro_bias_sigma, dt, off)
     frames = frames.put(i, T_world_body=T_world_body, lost=lost, uncertain=_uncertain(tracked, lost))
     if tracked is not None:
         frames = frames.put(
@@ -120,6 +127,8 @@ def _moved(
         frames=frames,
         twist=fade * np.asarray(se3.log(jnp.asarray(T_ref_body, jnp.float32)), np.float64) / dt,
         velocity_body=velocity_body if config.senses_speed else fade * velocity_body,
+        gyro_bias=gyro_bias,
+        gyro_bias_sigma=gyro_bias_sigma,
         false_acceleration=false_acceleration,
         params=params,
     )
@@ -130,11 +139,18 @@ def _uncertain(tracked: Tracked | None, lost: bool) -> bool:
     return tracked is None or lost or bool((np.asarray(tracked.sigma) > _SHARP).any())
 
 
-def _sigma(config: SlamConfig, dt: float, predicted: Float[np.ndarray, "4 4"], *, first: bool):
+def _sigma(config: SlamConfig, state: SlamState, dt: float, predicted: Float[np.ndarray, "4 4"]):
     """How far off [m, rad] a predicted motion may be."""
+    first = state.done == 1
     # Without two frames the speed is not known, and the accelerometer only changes it.
     speed = config.senses_speed and not first
-    sigma = prediction_sigma(dt, predicted, rotation=config.senses_rotation, speed=speed)
+    sigma = prediction_sigma(
+        dt,
+        predicted,
+        rotation=config.senses_rotation,
+        speed=speed,
+        gyro_bias_sigma=state.gyro_bias_sigma,
+    )
     if first:
         sigma = sigma + [0.3 * dt, 0.0 if config.senses_rotation else 0.3 * dt]  # as fast as a hand may move
     return sigma

@@ -6,12 +6,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
+from scipy.spatial.transform import Rotation
 
 from jaxpose import imu as inertial
 from jaxpose import se3
 from jaxpose.imu import Imu
 
 AHEAD = 8  # stamps of a predicted motion
+GYRO_BIAS_SIGMA = 0.1  # [rad/s] of a gyroscope of which nothing is known yet
 BEHIND = 3  # frames before the last one that the field keeps to
 
 
@@ -88,18 +90,21 @@ def predict(
     return stamps, poses
 
 
-def prediction_sigma(t: float, T_ref_body: np.ndarray, *, rotation: bool, speed: bool) -> np.ndarray:
+def prediction_sigma(
+    t: float, T_ref_body: np.ndarray, *, rotation: bool, speed: bool, gyro_bias_sigma: float = 0.0
+) -> np.ndarray:
     """How far off [m, rad] a predicted motion over `t` seconds may be, by what it was predicted from.
 
-    At constant speed 40% of the motion and a little; with the gyroscope 0.2 degrees, with the accelerometer
-    what a centimetre of error in the last poses and 0.1 m/s^2 of tilt or bias make of the speed.
+    At constant speed 40% of the motion and a little; with the gyroscope 0.2 degrees and what its bias, known
+    to `gyro_bias_sigma` [rad/s], makes; with the accelerometer what a centimetre of error in the last poses
+    and 0.1 m/s^2 of tilt or bias make of the speed.
     """
     trace = np.trace(T_ref_body[:3, :3])
     angle = float(np.arccos(np.clip((trace - 1) / 2, -1, 1)))
     distance = float(np.linalg.norm(T_ref_body[:3, 3]))
     return np.array([
         0.015 + 0.1 * t**2 if speed else 0.4 * distance + 0.01,
-        0.004 if rotation else 0.4 * angle + 0.01,
+        0.004 + gyro_bias_sigma * t if rotation else 0.4 * angle + 0.01,
     ])  # fmt: skip
 
 
@@ -132,3 +137,23 @@ def observe_acceleration(
     """
     gain = (sigma * t**2) ** 2 / ((sigma * t**2) ** 2 + position_sigma**2)
     return offset_world + gain * error_world / t**2
+
+
+def observe_gyro_bias(
+    bias: np.ndarray,
+    bias_sigma: float,
+    t: float,
+    R_predicted_found: np.ndarray,
+    *,
+    rotation_sigma: float = 0.003,
+    walk: float = 2e-3,
+) -> tuple[np.ndarray, float]:
+    """The gyroscope's bias [rad/s] in the body and its sigma, after a predicted turn over t was off.
+
+    What it was off by is about the bias that is left times t. Kalman's gain for turns known to
+    `rotation_sigma` [rad], the bias wandering by `walk` [rad/s/sqrt(s)].
+    """
+    off = Rotation.from_matrix(R_predicted_found).as_rotvec() / t
+    before, noise = bias_sigma**2 + walk**2 * t, (rotation_sigma / t) ** 2
+    gain = before / (before + noise)
+    return bias - gain * off, float(np.sqrt((1 - gain) * before))

@@ -16,6 +16,7 @@ from jaxpose.scenes import GridConfig, SceneField
 from jaxpose.slam.config import ImuMode, SlamConfig
 from jaxpose.slam.localise import next_pose
 from jaxpose.slam.observe import Image
+from jaxpose.slam.predict import GYRO_BIAS_SIGMA
 from jaxpose.slam.state import SlamState, no_frames
 from jaxpose.slam.system import System, make_system
 from jaxpose.slam.world import first_grid, map_frame, room_for, scene_params, seen_points
@@ -96,7 +97,7 @@ def begin(system: System, size: GridConfig | None = None) -> SlamState:
         size = first_grid(points, config)
     key, field_key = jax.random.split(jax.random.key(config.seed))
     return SlamState(
-        0, frames, np.zeros(6), np.zeros(3), np.zeros(3),
+        0, frames, np.zeros(6), np.zeros(3), np.zeros(3), GYRO_BIAS_SIGMA, np.zeros(3),
         system.framed.field.init(field_key), key, 0.0, size, system.world(size).start(),
     )  # fmt: skip
 

@@ -40,6 +40,8 @@ class SlamState(NamedTuple):
     frames: Frames
     twist: Float[np.ndarray, "6"]  # of the body over the last interval, per second
     velocity_body: Float[np.ndarray, "3"]  # [m/s] at the last frame
+    gyro_bias: Float[np.ndarray, "3"]  # [rad/s] in the body (`predict.observe_gyro_bias`)
+    gyro_bias_sigma: float
     false_acceleration: Float[np.ndarray, "3"]  # [m/s^2] in the world (`predict.observe_acceleration`)
     params: Params  # of the tracked field
     key: PRNGKeyArray

@@ -29,7 +29,7 @@ class System(NamedTuple):
     recording: Recording
     config: SlamConfig
     framed: Framed
-    readings: Callable[[int, np.ndarray, np.ndarray], Readings]
+    readings: Callable[[int, np.ndarray, np.ndarray, np.ndarray], Readings]
     world: Callable[[GridConfig], World]
     look: Callable[[int], np.ndarray]  # of a keyframe (`keyframes.look`)
 
@@ -46,21 +46,23 @@ def make_system(recording: Recording, config: SlamConfig) -> System:
     )
 
 
-def _readings(recording: Recording, config: SlamConfig) -> Callable[[int, np.ndarray, np.ndarray], Readings]:
-    """The readings after each frame, given the body's pose and the false acceleration [m/s^2] then."""
+def _readings(
+    recording: Recording, config: SlamConfig
+) -> Callable[[int, np.ndarray, np.ndarray, np.ndarray], Readings]:
+    """The readings after each frame, given the body's pose, its gyro bias and false acceleration then."""
     if len(recording.t) < 2:
         raise DataError(f"{recording.name}: expected at least 2 frames, got {len(recording.t)}")
     if config.imu == "none":
         empty = no_readings()
-        return lambda i, T_world_ref, offset: empty
+        return lambda i, T_world_ref, gyro_bias, false_acceleration: empty
     if recording.imu is None:
         raise DataError(f"{recording.name}: --imu {config.imu} needs inertial readings, and there are none")
     readings, mask = inertial.windows(recording.imu, recording.t)
 
-    def window(i, T_world_ref, offset):
-        gravity = jnp.asarray(recording.gravity_world + offset, jnp.float32)
+    def window(i, T_world_ref, gyro_bias, false_acceleration):
+        gravity = jnp.asarray(recording.gravity_world + false_acceleration, jnp.float32)
         local = inertial.Imu(*(jnp.asarray(x, jnp.float32) for x in (
-            readings.t[i] - recording.t[i], readings.omega_body[i], readings.acceleration_body[i]
+            readings.t[i] - recording.t[i], readings.omega_body[i] - gyro_bias, readings.acceleration_body[i]
         )))  # fmt: skip
         return integrate(local, jnp.asarray(mask[i]), jnp.asarray(T_world_ref[:3, :3], jnp.float32), gravity)
 

@@ -47,13 +47,13 @@ class Settle(NamedTuple):
 
     `motion` is the field's since the last frame, `inertial` its loss against the readings, `bring` Adam's
     way to a motion and to the readings, `pinned` that and Newton's to the poses at `interval.stamps[AHEAD -
-    1:]`.
+    1:]`, the first of them `T_ref_body`.
     """
 
     motion: Motion
     inertial: Callable[[Params, Gauge, Interval], Float[Array, ""]]
     bring: Callable[[Params, Gauge, Interval], Params]
-    pinned: Callable[[Params, Gauge, Interval, Float[Array, "4 4"]], tuple[Params, Float[Array, "4 4"]]]
+    pinned: Callable[[Params, Gauge, Interval, Float[Array, "4 4"]], Params]
 
 
 def make_settle(framed: Framed, config: TrackConfig, weights: ImuWeights, sigmas: ResidualSigmas) -> Settle:
@@ -77,14 +77,15 @@ def make_settle(framed: Framed, config: TrackConfig, weights: ImuWeights, sigmas
         return descend(params, gauge, interval, interval.stamps, interval.T_ref_body)
 
     @jax.jit
-    def pinned(params, gauge, interval, T_ref_body):
+    def pinned(before, gauge, interval, T_ref_body):
         # The motion found at this frame, and that of the frames before.
         stamps = interval.stamps[AHEAD - 1 :]
         poses = interval.T_ref_body[AHEAD - 1 :].at[0].set(T_ref_body)
-        if any(weights):
-            params = descend(params, gauge, interval, stamps, poses)
+        params = descend(before, gauge, interval, stamps, poses) if any(weights) else before
         params = pin(lambda p: jax.vmap(framed.direct(p, gauge))(stamps), params, poses)
-        return params, motion(params, gauge)(interval.t)
+        # Newton's steps can end far off, or nowhere: the next frame then starts from what was there before.
+        arrived = jnp.abs(motion(params, gauge)(interval.t) - T_ref_body).max() < 10 * _POSE_SIGMA
+        return jax.tree.map(lambda new, old: jnp.where(arrived, new, old), params, before)
 
     return Settle(motion, inertial, bring, pinned)
 
@@ -124,7 +125,7 @@ def make_track(
     def gauss_newton(scene_params, memory, params, T_world_ref, gauge, interval, image, far, key):
         del far  # nothing is rendered
         T_ref_body, seen = aligned(scene_params, memory, T_world_ref, interval, image, key)
-        return Tracked(*settle.pinned(params, gauge, interval, T_ref_body), *seen)
+        return Tracked(settle.pinned(params, gauge, interval, T_ref_body), T_ref_body, *seen)
 
     @jax.jit
     def gradient(scene_params, memory, params, T_world_ref, gauge, interval, image, far, key):

@@ -1,4 +1,7 @@
-"""What stands in the room: 5 x 4 x 2.6 m, origin on the floor's centre, z up; a ring is left free to walk."""
+"""What stands in the room: 5 x 4 x 2.6 m, origin on the floor's centre, z up; a ring is left free to walk.
+
+A larger room has the same things, those by a wall moved outwards with it.
+"""
 
 from functools import partial
 from typing import NamedTuple
@@ -8,7 +11,10 @@ import numpy as np
 from jaxpose.data.synthetic import paint
 from jaxpose.data.synthetic.paint import Painter
 
-SIZE = (5.0, 4.0, 2.6)
+Extent = tuple[float, float, float]
+
+SIZE: Extent = (5.0, 4.0, 2.6)
+_BY_A_WALL = 1.0  # [m] from the middle
 LIGHTS = ((1.1, 0.8, 2.55), (-1.2, -0.7, 2.55))  # centres of 0.6 m squares that shine down
 
 
@@ -203,9 +209,9 @@ def prints() -> list[Piece]:
     ]
 
 
-def shell(tint) -> Piece:
+def shell(tint, size: Extent) -> Piece:
     """The room: walls of four kinds, floor boards, ceiling panels with the lamps."""
-    glowing = tuple((x + SIZE[0] / 2, y + SIZE[1] / 2) for x, y, _ in LIGHTS)
+    glowing = tuple((x + size[0] / 2, y + size[1] / 2) for x, y, _ in LIGHTS)
     painters = (
         partial(paint.plaster, colour=tint(0.8, 0.75, 0.64)),
         partial(paint.wallpaper, colour=tint(0.55, 0.66, 0.62)),
@@ -214,11 +220,11 @@ def shell(tint) -> Piece:
         partial(paint.planks, colour=tint(0.64, 0.46, 0.3)),
         partial(paint.panels, glowing=glowing),
     )
-    half = SIZE[0] / 2, SIZE[1] / 2, SIZE[2] / 2
+    half = size[0] / 2, size[1] / 2, size[2] / 2
     return Piece("room", (0.0, 0.0, half[2]), half, 0.0, painters)
 
 
-def furnish(rng: np.random.Generator) -> list[Piece]:
+def furnish(rng: np.random.Generator, size: Extent = SIZE) -> list[Piece]:
     """All pieces; the layout is fixed but for small turns, tints come from `rng` too."""
     tint = lambda *colour: tuple(np.clip(np.multiply(colour, rng.uniform(0.9, 1.1, 3)), 0.05, 0.95))
     turned = lambda spread: float(rng.uniform(-spread, spread))
@@ -233,20 +239,30 @@ def furnish(rng: np.random.Generator) -> list[Piece]:
     ]
     ball = partial(paint.tiles, colours=((0.9, 0.9, 0.9), (0.8, 0.2, 0.2)), cell=0.12)
     tin = partial(paint.stains, colours=((0.2, 0.4, 0.65), (0.85, 0.8, 0.6)), wavelength=0.12)
+
+    def outwards(x, y):
+        beyond = np.subtract(size, SIZE) / 2
+        step = lambda at, by: float(at + np.sign(at) * by * (abs(at) > _BY_A_WALL))
+        return step(x, beyond[0]), step(y, beyond[1])
+
+    def stand(pieces, x, y, yaw=0.0):
+        return place(pieces, *outwards(x, y), yaw=yaw)
+
+    hung = [p._replace(centre=(*outwards(*p.centre[:2]), p.centre[2])) for p in prints()]
     rug = box(0, 0, 0, 2.2, 1.5, 0.012, partial(paint.rug, colour=tint(0.65, 0.24, 0.2)))
     return [
-        shell(tint),
-        *prints(),
-        *place([rug], 0.05, 0.0, turned(0.1)),
-        *place(table(1.0, 0.6, 0.42, oak, dark) + on_the_table(leaf), 0.0, 0.0, 0.4 + turned(0.3)),
-        *place(desk(oak, metal), -0.6, 1.6),
-        *place(chair(cloth, metal), -0.55, 1.05, np.pi + turned(0.3)),
-        *place(sofa(cloth, cushions[0], cushions[1]), 0.4, -1.52),
-        *place(shelf(rng, dark), -2.34, 0.35),
-        *place(cabinet(dark, oak, metal), 2.27, 0.0),
-        *place(cartons(), -2.05, -1.55, turned(0.3)),
-        *place(plant(dark, leaf), 2.1, -1.6),
-        *place(lamp(metal), 2.1, 1.6),
-        *place([sphere(0, 0, 0, 0.16, ball)], 1.2, 1.5),
-        *place(table(0.45, 0.45, 0.55, dark, dark) + [cylinder(0, 0, 0.55, 0.06, 0.2, tin)], 1.55, 1.6, 0.3),
+        shell(tint, size),
+        *hung,
+        *stand([rug], 0.05, 0.0, turned(0.1)),
+        *stand(table(1.0, 0.6, 0.42, oak, dark) + on_the_table(leaf), 0.0, 0.0, 0.4 + turned(0.3)),
+        *stand(desk(oak, metal), -0.6, 1.6),
+        *stand(chair(cloth, metal), -0.55, 1.05, np.pi + turned(0.3)),
+        *stand(sofa(cloth, cushions[0], cushions[1]), 0.4, -1.52),
+        *stand(shelf(rng, dark), -2.34, 0.35),
+        *stand(cabinet(dark, oak, metal), 2.27, 0.0),
+        *stand(cartons(), -2.05, -1.55, turned(0.3)),
+        *stand(plant(dark, leaf), 2.1, -1.6),
+        *stand(lamp(metal), 2.1, 1.6),
+        *stand([sphere(0, 0, 0, 0.16, ball)], 1.2, 1.5),
+        *stand(table(0.45, 0.45, 0.55, dark, dark) + [cylinder(0, 0, 0.55, 0.06, 0.2, tin)], 1.55, 1.6, 0.3),
     ]

@@ -2,25 +2,21 @@
 
 from dataclasses import dataclass
 from functools import lru_cache, partial
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt8
-from scipy.spatial.transform import Rotation
 
 from jaxpose.camera import Camera, pixel_direction
 from jaxpose.data.synthetic import hand, sensor
 from jaxpose.data.synthetic.atlas import Atlas, bake, gather, look_up
+from jaxpose.data.synthetic.drive import Drive, by_hand, recorded
 from jaxpose.data.synthetic.furniture import furnish
 from jaxpose.data.synthetic.shapes import Shapes, cast, locate, within_cone
-from jaxpose.imu import ADIS16448, GRAVITY_WORLD, Imu, ImuNoise
-from jaxpose.imu_simulation import simulate
+from jaxpose.imu import ADIS16448, GRAVITY_WORLD, ImuNoise
 from jaxpose.recording import Frame, Recording
-
-# The camera looks along the body's x, turned by some degrees and a few centimetres away.
-_LEVER_ARM = (0.045, 0.02, -0.03)
-_MOUNTING = (0.02, -0.035, 0.015)  # rotation vector [rad]
 
 
 @dataclass(frozen=True)
@@ -38,6 +34,8 @@ class RoomConfig:
     holes: bool = True  # no depth in the projector's shadow and on grazing surfaces
     imu_noise: ImuNoise = ADIS16448
     gravity_world: tuple[float, float, float] = GRAVITY_WORLD
+    # A EuRoC sequence whose recorded motion and IMU take the place of the walk and of `imu_*`.
+    along: Path | None = None
 
     def __post_init__(self):
         for name in ("duration_s", "rate_hz", "imu_rate_hz", "width", "height", "speed"):
@@ -53,19 +51,17 @@ class RoomConfig:
 def room(config: RoomConfig = RoomConfig()) -> Recording:
     """A walk through a furnished room, 5 x 4 x 2.6 m; frames are rendered when they are read.
 
-    The world is z-up with its origin on the floor; the body is the IMU, its axes forwards, left, up.
+    The world is z-up with its origin on the floor; the body is the IMU, its axes forwards, left, up. With
+    `config.along` it is a recorded motion with its readings (`drive.recorded`), the room as large as needed.
     """
     palette, brush, path = np.random.default_rng(config.seed).spawn(3)
-    pieces, shapes = gather(furnish(palette))
+    drive = _drive(config, path)
+    pieces, shapes = gather(furnish(palette, drive.room))
     atlas = bake(pieces, shapes, brush)
-    walk = hand.draw(path, config.speed)
     focal = 585 / 640 * config.width  # Kinect's angle of view
     centre = (config.width - 1) / 2, (config.height - 1) / 2
     camera = Camera(focal, focal, *centre, config.width, config.height)
-    T_body_cam = _mounting()
-    t = np.arange(int(np.floor(config.duration_s * config.rate_hz + 1e-9)) + 1) / config.rate_hz
-    T_world_body, imu = _drive(config, walk, t)
-    T_world_cam = T_world_body @ T_body_cam
+    T_world_cam = drive.T_world_body @ drive.T_body_cam
 
     @lru_cache(maxsize=128)
     def read(i: int) -> Frame:
@@ -78,33 +74,18 @@ def room(config: RoomConfig = RoomConfig()) -> Recording:
         depth.setflags(write=False)  # the next reader gets the same array
         return Frame(rgb, depth)
 
-    gravity = np.asarray(config.gravity_world, float)
-    return Recording("room", camera, t, read, T_world_cam, imu, T_body_cam, gravity)
+    return Recording(
+        drive.name, camera, drive.t, read, T_world_cam, drive.imu, drive.T_body_cam,
+        np.asarray(config.gravity_world, float), drive.notes,
+    )  # fmt: skip
 
 
-def _mounting() -> np.ndarray:
-    """T_body_cam: from right, down, forwards to forwards, left, up, not quite."""
-    T_body_cam = np.eye(4)
-    T_body_cam[:3, :3] = Rotation.from_rotvec(_MOUNTING).as_matrix() @ [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
-    T_body_cam[:3, 3] = _LEVER_ARM
-    return T_body_cam
-
-
-def _drive(config: RoomConfig, walk: hand.Walk, t: np.ndarray) -> tuple[np.ndarray, Imu]:
-    """T_world_body at the frames, and the IMU from the first to (at least) the last of them, in float64."""
-    samples = int(np.ceil(t[-1] * config.imu_rate_hz - 1e-9)) + 1
-    with jax.enable_x64(True):
-        times = jnp.asarray(t), jnp.asarray(np.arange(samples) / config.imu_rate_hz)
-        key = jax.random.key(config.seed)
-        T_world_body, imu = _readings(walk, *times, key, config.imu_noise, config.gravity_world)
-        return np.asarray(T_world_body), Imu(*(np.array(x) for x in imu))
-
-
-@partial(jax.jit, static_argnames=("noise", "gravity_world"))
-def _readings(walk, frame_times, imu_times, key, noise, gravity_world):
-    pose = partial(hand.pose, walk)
-    imu = simulate(pose, imu_times, noise=noise, key=key, gravity_world=gravity_world)
-    return jax.vmap(pose)(frame_times), imu
+def _drive(config: RoomConfig, path: np.random.Generator) -> Drive:
+    if config.along is not None:
+        return recorded(config.along, config.duration_s, config.rate_hz)
+    t = np.arange(int(np.floor(config.duration_s * config.rate_hz + 1e-9)) + 1) / config.rate_hz
+    walk = hand.draw(path, config.speed)
+    return by_hand(walk, t, config.imu_rate_hz, config.imu_noise, config.gravity_world, seed=config.seed)
 
 
 @partial(jax.jit, static_argnums=0)
