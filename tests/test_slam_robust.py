@@ -130,3 +130,48 @@ def test_an_imu_bridges_two_seconds_of_darkness(walk):
     assert truth is not None
     error = np.linalg.norm(result.T_world_cam[:, :3, 3] - truth[:, :3, 3], axis=1)
     assert error.max() < 0.06 and metrics.ate(result.T_world_cam, truth).rmse < 0.03
+
+
+def holes(frame, rng):
+    return frame._replace(depth=np.where(rng.uniform(size=frame.depth.shape) < 0.7, 0, frame.depth))
+
+
+def large_holes(frame, rng):
+    """Without depth in 70% of the image, in one piece."""
+    depth = frame.depth.copy()
+    depth[:, : int(0.7 * depth.shape[1])] = 0
+    return frame._replace(depth=depth)
+
+
+def sometimes(change):
+    return lambda frame, rng: change(frame) if rng.uniform() < 0.2 else frame
+
+
+FAULTS = {
+    "70% of the pixels without depth": holes,
+    "70% of the image without depth": large_holes,
+    "black at times": sometimes(lambda frame: frame._replace(rgb=0 * frame.rgb)),
+    "saturated at times": sometimes(lambda frame: frame._replace(rgb=0 * frame.rgb + np.uint8(255))),
+    "nothing at times": sometimes(lambda frame: Frame(0 * frame.rgb, 0 * frame.depth)),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("imu", ["none", "combined"])
+@pytest.mark.parametrize("fault", FAULTS.values(), ids=FAULTS.keys())
+def test_bad_frames_are_survived(walk, fault, imu):
+    def read(i):
+        return walk.read(i) if i == 0 else fault(walk.read(i), np.random.default_rng(i))
+
+    result = run(walk._replace(read=read), SlamConfig(imu=imu))
+    empty = [i for i in range(len(walk.t)) if not read(i).depth.any()]
+    assert set(np.flatnonzero(result.lost)) <= set(empty) and result.uncertain[empty].all()
+    assert metrics.ate(result.T_world_cam, walk.T_world_cam).rmse < 0.03
+
+
+@pytest.mark.slow
+def test_dropped_frames_are_survived(walk):
+    kept = np.flatnonzero(np.random.default_rng(1).uniform(size=len(walk.t)) > 0.3)
+    some = select(walk, np.union1d([0], kept))
+    result = run(some, SlamConfig(imu="combined"))
+    assert not result.lost.any() and metrics.ate(result.T_world_cam, some.T_world_cam).rmse < 0.02
