@@ -24,7 +24,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from jaxpose.camera import Camera
 from jaxpose.losses import weighted_mean
 from jaxpose.render import Ray, composite, sdf_weights
-from jaxpose.scenes import GridConfig, SceneField, node_positions
+from jaxpose.scenes import GridConfig, SceneField, node_axes
 from jaxpose.scenes.base import Params
 from jaxpose.scenes.grid import trilinear
 from jaxpose.slam.observe import (
@@ -80,30 +80,37 @@ def make_fuse(config: GridConfig, camera: Camera, band: float):
     (x, y, z, 5) holds the weights of distance, colour and wide distance, then the wide distance [m] and 1
     where it is known.
     """
-    nodes = node_positions(config)
+    x, y, z = (jnp.asarray(axis) for axis in node_axes(config))
     reach = _REACH * config.voxel
 
     @partial(jax.jit, donate_argnums=0)
     def update(state: MapState, image: Image, T_world_cam: Float[Array, "4 4"]) -> MapState:
-        (values,), memory = state
-        weight, wide, known = memory[..., :3], memory[..., 3], memory[..., 4]
-        at = locate(camera, T_world_cam, jnp.asarray(nodes))
-        depth = image.depth[at.row, at.column]
-        distance = depth - at.depth
-        worth = jnp.where(at.inside & (depth > 0), (depth_sigma(jnp.ones(())) / depth_sigma(depth)) ** 2, 0)
-        gain = jnp.stack([
-            jnp.where(distance > -band, worth, 0),
-            jnp.where(jnp.abs(distance) < band, worth, 0),
-            jnp.where(distance > -reach, worth, 0),
-        ], axis=-1)  # fmt: skip
-        total = weight + gain
-        share = gain / jnp.where(total > 0, total, 1)
-        rgb = image.rgb[at.row, at.column].astype(values.dtype) / 255
-        measured = jnp.concatenate([jnp.minimum(distance, band)[..., None], rgb], axis=-1)
-        values = values + share[..., jnp.array([0, 1, 1, 1])] * (measured - values)
-        wide = wide + share[..., 2] * (jnp.minimum(distance, reach) - wide)
-        known = jnp.where(gain[..., 2] > 0, 1, known)
-        memory = jnp.concatenate([jnp.minimum(total, _MEMORY), wide[..., None], known[..., None]], axis=-1)
+        def slice_at(item):
+            values, memory, x = item
+            weight, wide, known = memory[..., :3], memory[..., 3], memory[..., 4]
+            nodes = jnp.stack(jnp.broadcast_arrays(x, y[:, None], z[None, :]), axis=-1)
+            at = locate(camera, T_world_cam, nodes)
+            depth = image.depth[at.row, at.column]
+            distance = depth - at.depth
+            near = (depth_sigma(jnp.ones(())) / depth_sigma(depth)) ** 2
+            worth = jnp.where(at.inside & (depth > 0), near, 0)
+            gain = jnp.stack([
+                jnp.where(distance > -band, worth, 0),
+                jnp.where(jnp.abs(distance) < band, worth, 0),
+                jnp.where(distance > -reach, worth, 0),
+            ], axis=-1)  # fmt: skip
+            total = weight + gain
+            share = gain / jnp.where(total > 0, total, 1)
+            rgb = image.rgb[at.row, at.column].astype(values.dtype) / 255
+            measured = jnp.concatenate([jnp.minimum(distance, band)[..., None], rgb], axis=-1)
+            values = values + share[..., jnp.array([0, 1, 1, 1])] * (measured - values)
+            wide = wide + share[..., 2] * (jnp.minimum(distance, reach) - wide)
+            known = jnp.where(gain[..., 2] > 0, 1, known)
+            memory = [jnp.minimum(total, _MEMORY), wide[..., None], known[..., None]]
+            return values, jnp.concatenate(memory, axis=-1)
+
+        # One slice of the grid after the other: what is in between stays small, whatever the map's size.
+        values, memory = jax.lax.map(slice_at, (state.params[0], state.memory, x))
         return MapState((values,), memory)
 
     return lambda params: MapState(params, jnp.zeros((*params[0].shape[:3], 5))), update
