@@ -207,6 +207,8 @@ def test_imu_is_simulated_before_thinning(folder):
         (["--rate-hz", "0.01"], r"expected two frames"),
         (["--format", "sevenscenes"], r"expected --data"),
         (["--format", "room", "--data", "x"], r"expected no --data"),
+        (["--room.along", "x", "--data", "y"], r"--room\.along: expected no --data"),
+        (["--imu-offset-s", "nan"], r"--imu-offset-s: expected a finite number"),
         (["--data", "nowhere"], r"nowhere: expected a folder of frame-NNNNNN.*got nothing"),
     ],
 )
