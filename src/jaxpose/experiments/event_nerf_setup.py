@@ -39,7 +39,7 @@ _FAST_PLANS = {
     "positions": Plan(
         replace(_FAST_SCENE, window=(0.2, 0.7)), Rate(3e-3, 1e-4, 0.03), Rate(1e-6, 1e-7, 0.06)
     ),
-    "axis": Plan(replace(_FAST_SCENE, window=(0.1, 0.5)), Rate(1e-3, 3e-5, 0.03), Rate(1e-4, 3e-6, 0.06)),
+    "axis": Plan(replace(_FAST_SCENE, window=(0.1, 0.5)), Rate(1e-3, 3e-5, 0.03), Rate(3e-5, 2e-6, 0.06)),
     # A short slide is a small angle: turns of its size must come as slowly as it, after the scene.
     "all": Plan(replace(_FAST_SCENE, window=(0.1, 0.5)), Rate(3e-4, 2e-5, 0.3), Rate(1e-6, 1e-7, 0.3)),
 }
