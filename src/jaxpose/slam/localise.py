@@ -278,6 +278,7 @@ def _failed(system: System, state: SlamState, tracked: Tracked, reach: np.ndarra
     held = system.config.senses_speed and max(reach) < _HELD
     if frames.lost[max(i - 2, 0) : i].any() and not held:
         least, most = _FOUND_AGAIN if np.isfinite(reach).all() else _RECOGNISED
-    explained = np.isfinite(tracked.loss) and tracked.valid >= least
+    finite = np.isfinite(tracked.loss) and np.isfinite(tracked.T_ref_body).all()
+    explained = finite and tracked.valid >= least
     # One sigma is what the sensor's own noise leaves; without noise the usual loss would be next to nothing.
     return not (explained and tracked.loss < most * max(usual, 1.0))
