@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from jaxpose.camera import Camera
 from jaxpose.data import plain
 from jaxpose.data.imu_file import imu_notes, read_imu, read_mounting, with_imu
 from jaxpose.errors import DataError
 from jaxpose.experiments.imu_slam import Config, main
 from jaxpose.experiments.slam_options import load
+from jaxpose.recording import Recording
 
 T0_NS = 1_403_715_523_912_143_104  # of the first image, with ns that a float of seconds cannot hold
 PERIOD_NS = 5_000_000
@@ -189,3 +191,24 @@ def test_the_options_go_together(desk, capsys):
         )
     text = str(stop.value.code) + capsys.readouterr().err
     assert "no.csv" in text and "Traceback" not in text
+
+
+@pytest.mark.data
+def test_a_real_flight_agrees_with_gravity_as_mounted_and_not_when_turned(data_dir):
+    folder = data_dir / "euroc_V1_02_medium" / "mav0"
+    rows = np.loadtxt(folder / "imu0" / "data.csv", delimiter=",", comments="#")
+    imu = read_imu(folder / "imu0" / "data.csv")
+    np.testing.assert_allclose(imu.t, rows[:, 0] * 1e-9, rtol=0, atol=1e-6)
+    np.testing.assert_array_equal(np.hstack([imu.omega_body, imu.acceleration_body]), rows[:, 1:])
+    truth = np.loadtxt(folder / "state_groundtruth_estimate0" / "data.csv", delimiter=",", comments="#")[::40]
+    truth = truth[truth[:, 0] < rows[-1, 0]]
+    T_world_body = np.tile(np.eye(4), (len(truth), 1, 1))
+    T_world_body[:, :3, :3] = Rotation.from_quat(truth[:, [5, 6, 7, 4]]).as_matrix()
+    t = (truth[:, 0] - rows[0, 0]) * 1e-9
+    recording = Recording(
+        "V1_02", Camera(1.0, 1.0, 0.0, 0.0, 1, 1), t, lambda i: pytest.fail("no image is needed"),
+        T_world_body @ MOUNTING, imu._replace(t=imu.t - rows[0, 0] * 1e-9), MOUNTING,
+    )  # fmt: skip
+    assert imu_notes(recording, "imu0") == ()
+    (note,) = imu_notes(recording._replace(T_body_cam=np.eye(4)), "imu0")
+    assert "check unit and extrinsics" in note
