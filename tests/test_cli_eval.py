@@ -6,10 +6,12 @@ import re
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import refused
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -219,11 +221,7 @@ def test_the_table(files, capsys, tmp_path):
     assert image.format == "PNG" and len(np.unique(pixels.reshape(-1, 3), axis=0)) > 100
 
 
-def complaint(*args) -> str:
-    with pytest.raises(SystemExit) as stop:
-        cli.main([str(arg) for arg in args])
-    assert isinstance(stop.value.code, str) and "\n" not in stop.value.code  # stderr, exit code 1
-    return stop.value.code
+complaint = partial(refused.complaint, cli.main)
 
 
 def test_wrong_calls_cost_one_line(files, tmp_path):

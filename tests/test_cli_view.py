@@ -10,11 +10,13 @@ import subprocess
 import sys
 import threading
 import time
+from functools import partial
 
 import jax.numpy as jnp
 import msgspec
 import numpy as np
 import pytest
+import refused
 import trimesh
 import zstandard
 from PIL import Image
@@ -234,11 +236,7 @@ def test_a_port_that_is_taken(run):
             shown.close()
 
 
-def complaint(*args) -> str:
-    with pytest.raises(SystemExit) as stop:
-        cli.main(["view", *(str(arg) for arg in args)])
-    assert isinstance(stop.value.code, str) and "\n" not in stop.value.code
-    return stop.value.code
+complaint = partial(refused.complaint, lambda args: cli.main(["view", *args]))
 
 
 def test_wrong_calls_cost_one_line(run, tmp_path):

@@ -6,10 +6,12 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import refused
 from numpy.testing import assert_allclose, assert_array_equal
 
 from jaxpose import io, metrics, numpy_field
@@ -198,13 +200,7 @@ def test_real_events_with_unknown_poses(data_dir, tmp_path):
 # --- what is not possible --------------------------------------------------------------------------------
 
 
-def complaint(*args) -> str:
-    """The one line with which the command ends."""
-    with pytest.raises(SystemExit) as stop:
-        event_nerf.main([str(arg) for arg in args])
-    line = str(stop.value)
-    assert "\n" not in line
-    return line
+complaint = partial(refused.complaint, event_nerf.main)
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from PIL import Image
+from refused import complaint
 
 from jaxpose import io, metrics, numpy_field
 from jaxpose.data.synthetic import RoomConfig, room
@@ -65,15 +66,6 @@ def finished(tmp_path_factory) -> slam_run.Outcome:
     """`imu_slam --smoke`."""
     out = tmp_path_factory.mktemp("runs") / "imu"
     return imu_slam.run(imu_slam.Config(smoke=True, out=out))
-
-
-def complaint(main, *args) -> str:
-    """The line with which a command refuses its arguments."""
-    with pytest.raises(SystemExit) as stop:
-        main([str(arg) for arg in args])
-    assert isinstance(stop.value.code, str)  # printed on stderr, exit code 1
-    assert "\n" not in stop.value.code
-    return stop.value.code
 
 
 def test_run_folder_of_imu_slam(finished):
@@ -207,6 +199,8 @@ def test_imu_is_simulated_before_thinning(folder):
         (["--rate-hz", "0.01"], r"expected two frames"),
         (["--format", "sevenscenes"], r"expected --data"),
         (["--format", "room", "--data", "x"], r"expected no --data"),
+        (["--room.along", "x", "--data", "y"], r"--room\.along: expected no --data"),
+        (["--imu-offset-s", "nan"], r"--imu-offset-s: expected a finite number"),
         (["--data", "nowhere"], r"nowhere: expected a folder of frame-NNNNNN.*got nothing"),
     ],
 )

@@ -7,11 +7,13 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import refused
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.interpolate import splrep
 
@@ -45,13 +47,7 @@ def smoke(**changes):
     return Config(smoke=True, settle_steps=2, **changes)
 
 
-def complaint(*args) -> str:
-    """The one line that the command leaves on stderr, and exit code 1."""
-    with pytest.raises(SystemExit) as stop:
-        noisy_nerf.main([str(arg) for arg in args])
-    assert isinstance(stop.value.code, str)
-    assert "\n" not in stop.value.code
-    return stop.value.code
+complaint = partial(refused.complaint, noisy_nerf.main)
 
 
 # --- what a training starts from -------------------------------------------------------------------------

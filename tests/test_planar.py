@@ -2,12 +2,14 @@
 
 import json
 import re
+from functools import partial
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import refused
 import scipy.linalg
 import scipy.optimize
 from numpy.testing import assert_allclose, assert_array_equal
@@ -244,13 +246,7 @@ def test_small_motions_are_found(pose):
 # --- the command ----------------------------------------------------------------------------------------
 
 
-def complaint(*args) -> str:
-    """The line with which the command refuses its arguments."""
-    with pytest.raises(SystemExit) as stop:
-        planar.main([str(arg) for arg in args])
-    assert isinstance(stop.value.code, str)  # printed on stderr, exit code 1
-    assert "\n" not in stop.value.code
-    return stop.value.code
+complaint = partial(refused.complaint, planar.main)
 
 
 def numbers(folder):
