@@ -32,6 +32,7 @@ class Recording(NamedTuple):
     gravity_world: np.ndarray = np.array([0.0, 0.0, -9.80665])  # in the frame of `T_world_cam`
     notes: tuple[str, ...] = ()  # what the loader has to tell the user
     files: tuple[str, ...] = ()  # each colour image, relative to the recording's folder; empty: on no disk
+    t0: float = 0.0  # where `t` is 0 on the clock of the recording's files [s]
 
 
 class Photographs(NamedTuple):

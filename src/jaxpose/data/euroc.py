@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from jaxpose.camera import Camera
 from jaxpose.data.cloud import depth_from_cloud
 from jaxpose.data.euroc_files import (
+    IMU_COLUMNS,
     read_camera_sheet,
     read_csv,
     read_imu_sheet,
@@ -26,7 +27,6 @@ from jaxpose.io import Trajectory
 from jaxpose.io_ply import read_points
 from jaxpose.recording import Frame, Recording
 
-_IMU_COLUMNS = "7 columns (stamp, 3 rates, 3 accelerations)"
 _TRUTH_COLUMNS = "17 columns (stamp, 3 position, 4 quaternion, 3 velocity, 3 gyro bias, 3 accelerometer bias)"
 
 
@@ -105,6 +105,7 @@ def load(path: Path | str) -> Recording:
         imu=log.imu._replace(t=np.asarray(log.imu.t) - t[rows[0]]),
         T_body_cam=np.linalg.inv(log.T_body_imu) @ cam0.T_body_cam,
         notes=(*depth.notes, *lacking, *_unused(mav0)),
+        t0=cam0.stamps_ns[rows[0]] * 1e-9,
     )
 
 
@@ -125,7 +126,7 @@ def load_camera(path: Path | str, name: str = "cam0") -> CameraLog:
 def load_imu(path: Path | str) -> ImuLog:
     """Read `mav0/imu0` of the sequence folder `path`; DataError for files that cannot be used."""
     folder = sensors(path) / "imu0"
-    stamps, values, _ = read_csv(folder / "data.csv", _IMU_COLUMNS)
+    stamps, values, _ = read_csv(folder / "data.csv", IMU_COLUMNS)
     noise, T_body_imu = read_imu_sheet(folder / "sensor.yaml")
     imu = Imu(seconds(stamps, stamps[0]), values[:, :3], values[:, 3:])
     return ImuLog(imu, noise, stamps[0], T_body_imu)
@@ -138,7 +139,7 @@ def load_truth(path: Path | str) -> Truth:
     """
     file = sensors(path) / "state_groundtruth_estimate0" / "data.csv"
     stamps, values, lines = read_csv(file, _TRUTH_COLUMNS)
-    t0_ns = read_csv(sensors(path) / "imu0" / "data.csv", _IMU_COLUMNS, rows=1)[0][0]
+    t0_ns = read_csv(sensors(path) / "imu0" / "data.csv", IMU_COLUMNS, rows=1)[0][0]
     norm = np.linalg.norm(values[:, 3:7], axis=1)
     if abs(norm - 1).max() > 1e-2:
         row = int(abs(norm - 1).argmax())

@@ -11,6 +11,8 @@ from jaxpose.camera import Camera
 from jaxpose.errors import DataError
 from jaxpose.imu import ImuNoise
 
+IMU_COLUMNS = "7 columns (stamp, 3 rates, 3 accelerations)"
+
 
 def sensors(path: Path | str) -> Path:
     """The folder of the sensors, whether the sequence or `mav0` itself was named."""
@@ -92,7 +94,7 @@ def read_imu_sheet(file: Path) -> tuple[ImuNoise, Float[np.ndarray, "4 4"]]:
         gyro_walk=scalar("gyroscope_random_walk"),
         accelerometer_walk=scalar("accelerometer_random_walk"),
     )
-    return noise, _read_extrinsics(file, text)
+    return noise, read_extrinsics(file)
 
 
 def read_camera_sheet(file: Path) -> tuple[Camera, Float[np.ndarray, "4 4"]]:
@@ -106,7 +108,7 @@ def read_camera_sheet(file: Path) -> tuple[Camera, Float[np.ndarray, "4 4"]]:
     lens, size = row("distortion_coefficients", 4), row("resolution", 2)
     fx, fy, cx, cy = row("intrinsics", 4)
     camera = Camera(fx, fy, cx, cy, int(size[0]), int(size[1]), tuple(lens) if any(lens) else ())
-    return camera, _read_extrinsics(file, text)
+    return camera, read_extrinsics(file)
 
 
 def _read_yaml(file: Path) -> str:
@@ -114,9 +116,11 @@ def _read_yaml(file: Path) -> str:
     return re.sub("#.*", "", _read_text(file))
 
 
-def _read_extrinsics(file: Path, text: str) -> Float[np.ndarray, "4 4"]:
+def read_extrinsics(file: Path) -> Float[np.ndarray, "4 4"]:
     """The pose of the sensor on the body (`T_BS`)."""
-    return np.array(_numbers(file, text, r"^T_BS[ \t]*:[^\[]*\[([^\]]*)\]", "T_BS", 16)).reshape(4, 4)
+    return np.array(_numbers(file, _read_yaml(file), r"^T_BS[ \t]*:[^\[]*\[([^\]]*)\]", "T_BS", 16)).reshape(
+        4, 4
+    )
 
 
 def _numbers(file: Path, text: str, pattern: str, key: str, count: int) -> list[float]:

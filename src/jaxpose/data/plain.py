@@ -90,6 +90,7 @@ def load(path: Path | str, *, rate_hz: float = 30.0, depth_per_metre: float | No
         read=lambda i: Frame(read_color(colors[i]), read_depth(depths[i], per_metre)),
         T_world_cam=poses,
         notes=(*paired, *assumed, *lacking),
+        t0=float(t[rows[0]]),
     )
 
 

@@ -89,6 +89,7 @@ def load(path: Path | str, *, max_difference_s: float = 0.02, depth_per_metre: f
         read=lambda i: Frame(read_color(colors[i]), read_depth(depths[i], depth_per_metre)),
         T_world_cam=poses,
         notes=tuple(notes),
+        t0=float(stamps[0]),
     )
 
 

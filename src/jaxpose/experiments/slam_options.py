@@ -13,6 +13,7 @@ import tyro
 
 from jaxpose import io
 from jaxpose.data import recordings
+from jaxpose.data.imu_file import imu_notes, with_imu
 from jaxpose.data.synthetic import RoomConfig, room
 from jaxpose.ekf import PoseNoise
 from jaxpose.errors import DataError
@@ -40,6 +41,10 @@ class Options:
     frames: int | None = None  # how many frames from there, counted before thinning; None: all
     # How rotations pass through the true poses where an IMU is simulated from them: slerp is the paper's.
     imu_rotation: Literal["slerp", "spline"] = "slerp"
+    # A real IMU for --data: readings, EuRoC's csv or `t wx wy wz ax ay az`, by the clock of the images,
+    imu_file: Path | None = None
+    # and where its camera sits on it, T_body_cam: T_BS of a sensor.yaml, or 16 numbers.
+    imu_extrinsics: Path | None = None
     imu_offset_s: float = 0.0  # added to the stamps of a recording's own IMU [s]
     imu_filter: bool = False  # take off that IMU's biases with the help of the true poses, as the paper does
     compare: bool = False  # run all IMU modes and put them side by side
@@ -57,6 +62,11 @@ class Options:
                 raise ValueError(f"--{option.replace('_', '-')}: expected a positive number, got {value}")
         if not math.isfinite(self.imu_offset_s):
             raise ValueError(f"--imu-offset-s: expected a finite number, got {self.imu_offset_s}")
+        if (self.imu_file is None) != (self.imu_extrinsics is None):
+            given, other = ("file", "extrinsics") if self.imu_file else ("extrinsics", "file")
+            raise ValueError(f"--imu-{given}: expected --imu-{other} FILE with it, got none")
+        if self.imu_file is not None and self.data is None:
+            raise ValueError("--imu-file: expected --data DIR with it, as the room has readings of its own")
         if self.start < 0:
             raise ValueError(f"--start: expected 0 or more, got {self.start}")
         if self.frames is not None and self.frames < FEWEST_FRAMES:
@@ -117,6 +127,8 @@ def load(options: Options) -> Source:
     else:
         name = recordings.find_format(options.data) if options.format in ("room", None) else options.format
         recording = recordings.load(options.data, name, rate_hz=options.recorded_hz)
+        if options.imu_file is not None and options.imu_extrinsics is not None:
+            recording = with_imu(recording, options.imu_file, options.imu_extrinsics)
         imu, own_imu = "none", recording.imu is not None
         if not own_imu and (options.compare or options.slam.imu != "none"):
             recording = recording._replace(imu=_simulated(recording, options))
@@ -167,7 +179,12 @@ def _own_readings(recording: Recording, options: Options) -> tuple[Recording, st
     imu = recording.imu
     assert imu is not None
     imu = imu._replace(t=np.asarray(imu.t) + options.imu_offset_s)
-    what = f"{1 / float(np.median(np.diff(imu.t))):.3g} Hz, the recording's own, as read"
+    recording = recording._replace(imu=imu)
+    if options.compare or options.slam.imu != "none":
+        notes = imu_notes(recording, options.imu_file or recording.name)
+        recording = recording._replace(notes=(*recording.notes, *notes))
+    source = "the recording's own" if options.imu_file is None else f"of {options.imu_file.name}"
+    what = f"{1 / float(np.median(np.diff(imu.t))):.3g} Hz, {source}, as read"
     if options.imu_offset_s:
         what += f", {options.imu_offset_s:+g} s"
     if options.imu_filter:
@@ -262,6 +279,7 @@ def _cut(recording: Recording, options: Options) -> Recording:
     return recording._replace(
         t=recording.t - first,
         imu=None if imu is None else imu._replace(t=np.asarray(imu.t) - first),
+        t0=recording.t0 + float(first),
         T_world_cam=truth,
         notes=notes,
     )
