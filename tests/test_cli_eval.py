@@ -219,14 +219,7 @@ def test_the_table(files, capsys, tmp_path):
     assert image.format == "PNG" and len(np.unique(pixels.reshape(-1, 3), axis=0)) > 100
 
 
-def complaint(*args) -> str:
-    with pytest.raises(SystemExit) as stop:
-        cli.main([str(arg) for arg in args])
-    assert isinstance(stop.value.code, str) and "\n" not in stop.value.code  # stderr, exit code 1
-    return stop.value.code
-
-
-def test_wrong_calls_cost_one_line(files, tmp_path):
+def test_wrong_calls_cost_one_line(files, tmp_path, complaint):
     estimate, truth = files
     (tmp_path / "folder" / "none").mkdir(parents=True)
     io.write_tum(tmp_path / "folder" / "none" / "trajectory.txt", paths()[0])
@@ -250,7 +243,7 @@ def test_wrong_calls_cost_one_line(files, tmp_path):
         (["eval", truth, truth, "--plot", "p.jpg"], "--plot: expected a name that ends in .png, got p.jpg"),
         (["eval", tmp_path / "broken", truth], "broken/results.json: expected the results of a run"),
     ):  # fmt: skip
-        line = complaint(*args)
+        line = complaint(cli.main, *args)
         assert line.startswith("jaxpose") and re.search(message, line, re.IGNORECASE), line
 
 

@@ -1,11 +1,6 @@
 """The event command: what it starts from, its run folder, killed and resumed, what it refuses."""
 
-import json
 import re
-import signal
-import subprocess
-import sys
-import time
 
 import jax.numpy as jnp
 import numpy as np
@@ -112,11 +107,11 @@ def test_what_a_run_leaves(finished):
     assert problem.recording.notes[0] in report(*outcome)
 
 
-def test_resuming_a_finished_run_returns_it_and_one_of_other_settings_is_refused(finished, capsys):
+def test_resuming_a_finished_run_returns_it_and_one_of_other_settings_is_refused(finished, complaint):
     outcome, _ = finished
     again = event_nerf.run(smoke(out=outcome.folder, resume=True))
     assert again.results["loss" if "loss" in again.results else "psnr"] == outcome.results["psnr"]
-    line = complaint("--smoke", "--out", outcome.folder, "--resume", "--known", "6")
+    line = complaint(event_nerf.main, "--smoke", "--out", outcome.folder, "--resume", "--known", "6")
     assert "expected --known None, as it began, got 6" in line
 
 
@@ -145,23 +140,10 @@ def test_a_study_puts_runs_side_by_side(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_sigkill_in_the_middle_changes_no_number(tmp_path):
-    """The real signal, to a process in the middle of its steps."""
-    args = "--image-width 16 --events 64 --steps 1000".split()
-    code = "from jaxpose.experiments import joint_loop as j, event_nerf as n; j._SAVE_EVERY_S = 0; n.main()"
-    start = lambda out: subprocess.Popen([sys.executable, "-c", code, *args, "--out", out, "--resume"])
-    assert start(tmp_path / "whole").wait() == 0
-    process, checkpoint = start(tmp_path / "cut"), tmp_path / "cut" / "checkpoint.npz"
-    while not checkpoint.exists():
-        time.sleep(0.02)
-    process.kill()
-    assert process.wait() == -signal.SIGKILL
-    with np.load(checkpoint) as file:
-        assert file[".state.step"] < 1000
-    assert start(tmp_path / "cut").wait() == 0
-    whole, cut = (json.loads((tmp_path / n / "results.json").read_text()) for n in ("whole", "cut"))
+def test_sigkill_in_the_middle_changes_no_number(whole_and_killed):
+    whole, killed = whole_and_killed("event_nerf", "--image-width 16 --events 64", steps=1000)
     for key in ("rotation_error_deg", "translation_error", "psnr", "ssim"):
-        assert cut[key] == whole[key]
+        assert killed[key] == whole[key]
 
 
 def test_the_correction_undoes_a_slope_and_an_offset_of_log_intensity():
@@ -198,15 +180,6 @@ def test_real_events_with_unknown_poses(data_dir, tmp_path):
 # --- what is not possible --------------------------------------------------------------------------------
 
 
-def complaint(*args) -> str:
-    """The one line with which the command ends."""
-    with pytest.raises(SystemExit) as stop:
-        event_nerf.main([str(arg) for arg in args])
-    line = str(stop.value)
-    assert "\n" not in line
-    return line
-
-
 @pytest.mark.parametrize(
     ("args", "expected"),
     [
@@ -223,9 +196,9 @@ def complaint(*args) -> str:
         (["--resume"], "--resume: expected --out DIR or --name NAME"),
     ],
 )
-def test_bad_options_are_one_line(args, expected, tmp_path):
+def test_bad_options_are_one_line(args, expected, tmp_path, complaint):
     out = [] if "--resume" in args else ["--out", tmp_path / "out"]
-    line = complaint(*args, *out)
+    line = complaint(event_nerf.main, *args, *out)
     assert line.startswith("event_nerf: ")
     assert re.search(expected, line), line
     assert not (tmp_path / "out").exists()

@@ -67,15 +67,6 @@ def finished(tmp_path_factory) -> slam_run.Outcome:
     return imu_slam.run(imu_slam.Config(smoke=True, out=out))
 
 
-def complaint(main, *args) -> str:
-    """The line with which a command refuses its arguments."""
-    with pytest.raises(SystemExit) as stop:
-        main([str(arg) for arg in args])
-    assert isinstance(stop.value.code, str)  # printed on stderr, exit code 1
-    assert "\n" not in stop.value.code
-    return stop.value.code
-
-
 def test_run_folder_of_imu_slam(finished):
     folder, results = finished
     assert {path.name for path in folder.iterdir()} == FILES | {"inertial.png"}
@@ -210,14 +201,14 @@ def test_imu_is_simulated_before_thinning(folder):
         (["--data", "nowhere"], r"nowhere: expected a folder of frame-NNNNNN.*got nothing"),
     ],
 )
-def test_bad_options_are_one_line(args, expected, tmp_path):
+def test_bad_options_are_one_line(args, expected, tmp_path, complaint):
     line = complaint(imu_slam.main, *args, "--out", tmp_path / "out")
     assert line.startswith("imu_slam: ")
     assert re.search(expected, line), line
     assert not (tmp_path / "out").exists()
 
 
-def test_bad_recordings_are_one_line(folder, tmp_path):
+def test_bad_recordings_are_one_line(folder, tmp_path, complaint):
     out = tmp_path / "out"
     ask = lambda *args, main=rgbd_slam.main: complaint(
         main, "--data", folder, "--recorded-hz", 5, "--out", out, *args
@@ -246,14 +237,14 @@ def test_bad_recordings_are_one_line(folder, tmp_path):
     assert not out.exists()
 
 
-def test_output_that_cannot_be_written(folder, tmp_path):
+def test_output_that_cannot_be_written(folder, tmp_path, complaint):
     (tmp_path / "file").write_text("mine")
     line = complaint(rgbd_slam.main, "--data", folder, "--out", tmp_path / "file" / "run")
     assert str(tmp_path / "file") in line
     assert (tmp_path / "file").read_text() == "mine"
 
 
-def test_a_failed_run_takes_away_only_what_it_made(folder, tmp_path):
+def test_a_failed_run_takes_away_only_what_it_made(folder, tmp_path, complaint):
     out = tmp_path / "out"
     out.mkdir()
     (out / "mine.txt").write_text("mine")

@@ -2,10 +2,6 @@
 
 import json
 import re
-import signal
-import subprocess
-import sys
-import time
 from dataclasses import replace
 
 import jax
@@ -43,15 +39,6 @@ def compile_quickly():
 
 def smoke(**changes):
     return Config(smoke=True, settle_steps=2, **changes)
-
-
-def complaint(*args) -> str:
-    """The one line that the command leaves on stderr, and exit code 1."""
-    with pytest.raises(SystemExit) as stop:
-        noisy_nerf.main([str(arg) for arg in args])
-    assert isinstance(stop.value.code, str)
-    assert "\n" not in stop.value.code
-    return stop.value.code
 
 
 # --- what a training starts from -------------------------------------------------------------------------
@@ -160,7 +147,7 @@ def numbers(results):
     return {key: results[key] for key in keys} | {"history": history.tolist()}
 
 
-def test_a_killed_run_resumed_has_the_numbers_of_a_whole_one(tmp_path, monkeypatch, capsys):
+def test_a_killed_run_resumed_has_the_numbers_of_a_whole_one(tmp_path, monkeypatch, capsys, complaint):
     monkeypatch.setattr("jaxpose.experiments.noisy_nerf_setup._SMOKE", build_three_chunks())
     monkeypatch.setattr("jaxpose.experiments.joint_loop._SAVE_EVERY_S", 0.0)
     whole = noisy_nerf.run(smoke(pose="spline_reset", out=tmp_path / "whole"))
@@ -186,13 +173,13 @@ def test_a_killed_run_resumed_has_the_numbers_of_a_whole_one(tmp_path, monkeypat
     assert "SMOKE" in said.out and str(out) in said.out and "| spline_reset" in said.out
     resumed = json.loads((out / "results.json").read_text())
     assert numbers(resumed) == numbers(json.loads((whole.folder / "results.json").read_text()))
-    assert "expected --seed 0, as it began, got 1" in complaint(*again, "--seed", 1)
+    assert "expected --seed 0, as it began, got 1" in complaint(noisy_nerf.main, *again, "--seed", 1)
     changed = (out / "results.json").stat().st_mtime_ns
     noisy_nerf.main(again)
     assert (out / "results.json").stat().st_mtime_ns == changed, "a finished run is not done again"
     (out / "results.json").unlink()
     (out / "checkpoint.npz").write_bytes(b"half a file")
-    assert "checkpoint.npz: expected a checkpoint" in complaint(*again)
+    assert "checkpoint.npz: expected a checkpoint" in complaint(noisy_nerf.main, *again)
 
 
 def build_three_chunks():
@@ -200,22 +187,10 @@ def build_three_chunks():
 
 
 @pytest.mark.slow
-def test_sigkill_in_the_middle_changes_no_number(tmp_path):
-    """The real signal, to a process in the middle of its steps."""
-    args = "--orbit-views 10 --image-width 24 --rays 256 --steps 1500 --settle-steps 2".split()
-    code = "from jaxpose.experiments import joint_loop as j, noisy_nerf as n; j._SAVE_EVERY_S = 0; n.main()"
-    start = lambda out: subprocess.Popen([sys.executable, "-c", code, *args, "--out", out, "--resume"])
-    assert start(tmp_path / "whole").wait() == 0
-    process, checkpoint = start(tmp_path / "cut"), tmp_path / "cut" / "checkpoint.npz"
-    while not checkpoint.exists():
-        time.sleep(0.02)
-    process.kill()
-    assert process.wait() == -signal.SIGKILL
-    with np.load(checkpoint) as file:
-        assert file[".state.step"] < 1500
-    assert start(tmp_path / "cut").wait() == 0
-    whole, cut = (json.loads((tmp_path / n / "results.json").read_text()) for n in ("whole", "cut"))
-    assert numbers(cut) == numbers(whole)
+def test_sigkill_in_the_middle_changes_no_number(whole_and_killed):
+    args = "--orbit-views 10 --image-width 24 --rays 256 --settle-steps 2"
+    whole, killed = whole_and_killed("noisy_nerf", args, steps=1500)
+    assert numbers(killed) == numbers(whole)
 
 
 def test_what_a_run_leaves(tmp_path):
@@ -320,15 +295,15 @@ def test_unknown_poses_of_a_forward_facing_scene_are_found(data_dir, tmp_path):
         (["--smoke", "--every", "5"], r"expected at least 4 images to train on, got 2"),
     ],
 )
-def test_bad_options_are_one_line(args, expected, tmp_path):
+def test_bad_options_are_one_line(args, expected, tmp_path, complaint):
     out = [] if "--resume" in args else ["--out", tmp_path / "out"]
-    line = complaint(*args, *out)
+    line = complaint(noisy_nerf.main, *args, *out)
     assert line.startswith("noisy_nerf: ")
     assert re.search(expected, line), line
     assert not (tmp_path / "out").exists()
 
 
-def test_a_folder_of_nothing_names_what_was_expected(tmp_path):
+def test_a_folder_of_nothing_names_what_was_expected(tmp_path, complaint):
     (tmp_path / "data").mkdir()
-    line = complaint("--data", tmp_path / "data", "--out", tmp_path / "out")
+    line = complaint(noisy_nerf.main, "--data", tmp_path / "data", "--out", tmp_path / "out")
     assert "transforms" in line and "poses_bounds.npy" in line
