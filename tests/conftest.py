@@ -1,11 +1,6 @@
-"""Fixtures: both precisions, strict dtypes, the data folder, commands that are refused or killed."""
+"""Fixtures: both precisions, strict dtypes, the data folder."""
 
-import json
 import os
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 from typing import NamedTuple
 
@@ -79,42 +74,3 @@ def save():
 def metres():
     """Depth [m] that counts mean."""
     return lambda counts, per_metre: np.where(counts == 65535, 0, counts) / per_metre
-
-
-@pytest.fixture(scope="session")
-def complaint():
-    """The line with which a command refuses its arguments: on stderr, with exit code 1."""
-
-    def ask(main, *args) -> str:
-        with pytest.raises(SystemExit) as stop:
-            main([str(arg) for arg in args])
-        line = stop.value.code
-        assert isinstance(line, str)  # so Python prints it on stderr and exits with 1
-        assert "\n" not in line
-        return line
-
-    return ask
-
-
-@pytest.fixture
-def whole_and_killed(tmp_path):
-    """Results of a training left alone, and of one that SIGKILL ended in the middle of its steps, resumed."""
-
-    def train(experiment: str, args: str, steps: int) -> tuple[dict, dict]:
-        code = f"from jaxpose.experiments import joint_loop, {experiment}; joint_loop._SAVE_EVERY_S = 0; "
-        command = [sys.executable, "-c", f"{code}{experiment}.main()", *args.split(), "--steps", str(steps)]
-        start = lambda name: subprocess.Popen([*command, "--out", tmp_path / name, "--resume"])
-        assert start("whole").wait() == 0
-        process, checkpoint = start("killed"), tmp_path / "killed" / "checkpoint.npz"
-        while not checkpoint.exists():
-            assert process.poll() is None
-            time.sleep(0.02)
-        process.kill()
-        assert process.wait() == -signal.SIGKILL
-        with np.load(checkpoint) as file:
-            assert file[".state.step"] < steps
-        assert start("killed").wait() == 0
-        whole, killed = (json.loads((tmp_path / n / "results.json").read_text()) for n in ("whole", "killed"))
-        return whole, killed
-
-    return train

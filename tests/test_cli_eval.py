@@ -6,10 +6,12 @@ import re
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import refused
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -219,7 +221,10 @@ def test_the_table(files, capsys, tmp_path):
     assert image.format == "PNG" and len(np.unique(pixels.reshape(-1, 3), axis=0)) > 100
 
 
-def test_wrong_calls_cost_one_line(files, tmp_path, complaint):
+complaint = partial(refused.complaint, cli.main)
+
+
+def test_wrong_calls_cost_one_line(files, tmp_path):
     estimate, truth = files
     (tmp_path / "folder" / "none").mkdir(parents=True)
     io.write_tum(tmp_path / "folder" / "none" / "trajectory.txt", paths()[0])
@@ -243,7 +248,7 @@ def test_wrong_calls_cost_one_line(files, tmp_path, complaint):
         (["eval", truth, truth, "--plot", "p.jpg"], "--plot: expected a name that ends in .png, got p.jpg"),
         (["eval", tmp_path / "broken", truth], "broken/results.json: expected the results of a run"),
     ):  # fmt: skip
-        line = complaint(cli.main, *args)
+        line = complaint(*args)
         assert line.startswith("jaxpose") and re.search(message, line, re.IGNORECASE), line
 
 

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import msgspec
 import numpy as np
 import pytest
+import refused
 import trimesh
 import zstandard
 from PIL import Image
@@ -232,20 +233,22 @@ def test_a_port_that_is_taken(run):
             shown.close()
 
 
-def test_wrong_calls_cost_one_line(run, tmp_path, complaint):
-    ask = partial(complaint, cli.main, "view")
+complaint = partial(refused.complaint, lambda args: cli.main(["view", *args]))
+
+
+def test_wrong_calls_cost_one_line(run, tmp_path):
     (tmp_path / "empty").mkdir()
-    assert ask(tmp_path / "empty").startswith("jaxpose view: ")
-    assert "expected a run folder with trajectory.txt" in ask(tmp_path / "empty")
-    assert "runs in it: run" in ask(tmp_path)
-    assert "got nothing" in ask(tmp_path / "none")
-    assert "--save: expected a name that ends in .html" in ask(run, "--save", "x.viser")
-    assert "--port: expected" in ask(run, "--port", "65536")
-    assert "--frustums: expected" in ask(run, "--frustums", "-1")
+    assert complaint(tmp_path / "empty").startswith("jaxpose view: ")
+    assert "expected a run folder with trajectory.txt" in complaint(tmp_path / "empty")
+    assert "runs in it: run" in complaint(tmp_path)
+    assert "got nothing" in complaint(tmp_path / "none")
+    assert "--save: expected a name that ends in .html" in complaint(run, "--save", "x.viser")
+    assert "--port: expected" in complaint(run, "--port", "65536")
+    assert "--frustums: expected" in complaint(run, "--frustums", "-1")
     (run / "mesh.ply").write_text("no mesh")
-    assert "mesh.ply: expected a PLY" in ask(run, "--frustums", "0")
+    assert "mesh.ply: expected a PLY" in complaint(run, "--frustums", "0")
     (run / "map.npz").write_text("no map")
-    assert "map.npz: expected a map" in ask(run)
+    assert "map.npz: expected a map" in complaint(run)
 
 
 def test_a_map_of_another_kind(run):
@@ -259,12 +262,11 @@ def test_a_map_of_another_kind(run):
         read_scene(run, 0)
 
 
-def test_without_the_extra(run, monkeypatch, complaint):
+def test_without_the_extra(run, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     monkeypatch.delitem(sys.modules, "jaxpose.commands.view_page")
     monkeypatch.delattr("jaxpose.commands.view_page")
-    line = complaint(cli.main, "view", run)
-    assert line == 'jaxpose view: expected viser, got none: pip install "jaxpose[viewer]"'
+    assert complaint(run) == 'jaxpose view: expected viser, got none: pip install "jaxpose[viewer]"'
 
 
 def test_help(capsys):

@@ -1,10 +1,13 @@
 """The event command: what it starts from, its run folder, killed and resumed, what it refuses."""
 
 import re
+from functools import partial
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import refused
+from killed import whole_and_killed
 from numpy.testing import assert_allclose, assert_array_equal
 
 from jaxpose import io, metrics, numpy_field
@@ -107,11 +110,11 @@ def test_what_a_run_leaves(finished):
     assert problem.recording.notes[0] in report(*outcome)
 
 
-def test_resuming_a_finished_run_returns_it_and_one_of_other_settings_is_refused(finished, complaint):
+def test_resuming_a_finished_run_returns_it_and_one_of_other_settings_is_refused(finished, capsys):
     outcome, _ = finished
     again = event_nerf.run(smoke(out=outcome.folder, resume=True))
     assert again.results["loss" if "loss" in again.results else "psnr"] == outcome.results["psnr"]
-    line = complaint(event_nerf.main, "--smoke", "--out", outcome.folder, "--resume", "--known", "6")
+    line = complaint("--smoke", "--out", outcome.folder, "--resume", "--known", "6")
     assert "expected --known None, as it began, got 6" in line
 
 
@@ -140,8 +143,8 @@ def test_a_study_puts_runs_side_by_side(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_sigkill_in_the_middle_changes_no_number(whole_and_killed):
-    whole, killed = whole_and_killed("event_nerf", "--image-width 16 --events 64", steps=1000)
+def test_sigkill_in_the_middle_changes_no_number(tmp_path):
+    whole, killed = whole_and_killed("event_nerf", "--image-width 16 --events 64", 1000, tmp_path)
     for key in ("rotation_error_deg", "translation_error", "psnr", "ssim"):
         assert killed[key] == whole[key]
 
@@ -180,6 +183,9 @@ def test_real_events_with_unknown_poses(data_dir, tmp_path):
 # --- what is not possible --------------------------------------------------------------------------------
 
 
+complaint = partial(refused.complaint, event_nerf.main)
+
+
 @pytest.mark.parametrize(
     ("args", "expected"),
     [
@@ -196,9 +202,9 @@ def test_real_events_with_unknown_poses(data_dir, tmp_path):
         (["--resume"], "--resume: expected --out DIR or --name NAME"),
     ],
 )
-def test_bad_options_are_one_line(args, expected, tmp_path, complaint):
+def test_bad_options_are_one_line(args, expected, tmp_path):
     out = [] if "--resume" in args else ["--out", tmp_path / "out"]
-    line = complaint(event_nerf.main, *args, *out)
+    line = complaint(*args, *out)
     assert line.startswith("event_nerf: ")
     assert re.search(expected, line), line
     assert not (tmp_path / "out").exists()

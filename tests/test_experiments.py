@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from PIL import Image
+from refused import complaint
 
 from jaxpose import io, metrics, numpy_field
 from jaxpose.data.synthetic import RoomConfig, room
@@ -198,17 +199,19 @@ def test_imu_is_simulated_before_thinning(folder):
         (["--rate-hz", "0.01"], r"expected two frames"),
         (["--format", "sevenscenes"], r"expected --data"),
         (["--format", "room", "--data", "x"], r"expected no --data"),
+        (["--room.along", "x", "--data", "y"], r"--room\.along: expected no --data"),
+        (["--imu-offset-s", "nan"], r"--imu-offset-s: expected a finite number"),
         (["--data", "nowhere"], r"nowhere: expected a folder of frame-NNNNNN.*got nothing"),
     ],
 )
-def test_bad_options_are_one_line(args, expected, tmp_path, complaint):
+def test_bad_options_are_one_line(args, expected, tmp_path):
     line = complaint(imu_slam.main, *args, "--out", tmp_path / "out")
     assert line.startswith("imu_slam: ")
     assert re.search(expected, line), line
     assert not (tmp_path / "out").exists()
 
 
-def test_bad_recordings_are_one_line(folder, tmp_path, complaint):
+def test_bad_recordings_are_one_line(folder, tmp_path):
     out = tmp_path / "out"
     ask = lambda *args, main=rgbd_slam.main: complaint(
         main, "--data", folder, "--recorded-hz", 5, "--out", out, *args
@@ -237,14 +240,14 @@ def test_bad_recordings_are_one_line(folder, tmp_path, complaint):
     assert not out.exists()
 
 
-def test_output_that_cannot_be_written(folder, tmp_path, complaint):
+def test_output_that_cannot_be_written(folder, tmp_path):
     (tmp_path / "file").write_text("mine")
     line = complaint(rgbd_slam.main, "--data", folder, "--out", tmp_path / "file" / "run")
     assert str(tmp_path / "file") in line
     assert (tmp_path / "file").read_text() == "mine"
 
 
-def test_a_failed_run_takes_away_only_what_it_made(folder, tmp_path, complaint):
+def test_a_failed_run_takes_away_only_what_it_made(folder, tmp_path):
     out = tmp_path / "out"
     out.mkdir()
     (out / "mine.txt").write_text("mine")

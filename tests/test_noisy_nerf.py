@@ -3,11 +3,14 @@
 import json
 import re
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import refused
+from killed import whole_and_killed
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.interpolate import splrep
 
@@ -39,6 +42,9 @@ def compile_quickly():
 
 def smoke(**changes):
     return Config(smoke=True, settle_steps=2, **changes)
+
+
+complaint = partial(refused.complaint, noisy_nerf.main)
 
 
 # --- what a training starts from -------------------------------------------------------------------------
@@ -147,7 +153,7 @@ def numbers(results):
     return {key: results[key] for key in keys} | {"history": history.tolist()}
 
 
-def test_a_killed_run_resumed_has_the_numbers_of_a_whole_one(tmp_path, monkeypatch, capsys, complaint):
+def test_a_killed_run_resumed_has_the_numbers_of_a_whole_one(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("jaxpose.experiments.noisy_nerf_setup._SMOKE", build_three_chunks())
     monkeypatch.setattr("jaxpose.experiments.joint_loop._SAVE_EVERY_S", 0.0)
     whole = noisy_nerf.run(smoke(pose="spline_reset", out=tmp_path / "whole"))
@@ -173,13 +179,13 @@ def test_a_killed_run_resumed_has_the_numbers_of_a_whole_one(tmp_path, monkeypat
     assert "SMOKE" in said.out and str(out) in said.out and "| spline_reset" in said.out
     resumed = json.loads((out / "results.json").read_text())
     assert numbers(resumed) == numbers(json.loads((whole.folder / "results.json").read_text()))
-    assert "expected --seed 0, as it began, got 1" in complaint(noisy_nerf.main, *again, "--seed", 1)
+    assert "expected --seed 0, as it began, got 1" in complaint(*again, "--seed", 1)
     changed = (out / "results.json").stat().st_mtime_ns
     noisy_nerf.main(again)
     assert (out / "results.json").stat().st_mtime_ns == changed, "a finished run is not done again"
     (out / "results.json").unlink()
     (out / "checkpoint.npz").write_bytes(b"half a file")
-    assert "checkpoint.npz: expected a checkpoint" in complaint(noisy_nerf.main, *again)
+    assert "checkpoint.npz: expected a checkpoint" in complaint(*again)
 
 
 def build_three_chunks():
@@ -187,9 +193,9 @@ def build_three_chunks():
 
 
 @pytest.mark.slow
-def test_sigkill_in_the_middle_changes_no_number(whole_and_killed):
+def test_sigkill_in_the_middle_changes_no_number(tmp_path):
     args = "--orbit-views 10 --image-width 24 --rays 256 --settle-steps 2"
-    whole, killed = whole_and_killed("noisy_nerf", args, steps=1500)
+    whole, killed = whole_and_killed("noisy_nerf", args, 1500, tmp_path)
     assert numbers(killed) == numbers(whole)
 
 
@@ -295,15 +301,15 @@ def test_unknown_poses_of_a_forward_facing_scene_are_found(data_dir, tmp_path):
         (["--smoke", "--every", "5"], r"expected at least 4 images to train on, got 2"),
     ],
 )
-def test_bad_options_are_one_line(args, expected, tmp_path, complaint):
+def test_bad_options_are_one_line(args, expected, tmp_path):
     out = [] if "--resume" in args else ["--out", tmp_path / "out"]
-    line = complaint(noisy_nerf.main, *args, *out)
+    line = complaint(*args, *out)
     assert line.startswith("noisy_nerf: ")
     assert re.search(expected, line), line
     assert not (tmp_path / "out").exists()
 
 
-def test_a_folder_of_nothing_names_what_was_expected(tmp_path, complaint):
+def test_a_folder_of_nothing_names_what_was_expected(tmp_path):
     (tmp_path / "data").mkdir()
-    line = complaint(noisy_nerf.main, "--data", tmp_path / "data", "--out", tmp_path / "out")
+    line = complaint("--data", tmp_path / "data", "--out", tmp_path / "out")
     assert "transforms" in line and "poses_bounds.npy" in line

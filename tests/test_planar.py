@@ -2,12 +2,14 @@
 
 import json
 import re
+from functools import partial
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import refused
 import scipy.linalg
 import scipy.optimize
 from numpy.testing import assert_allclose, assert_array_equal
@@ -244,13 +246,16 @@ def test_small_motions_are_found(pose):
 # --- the command ----------------------------------------------------------------------------------------
 
 
+complaint = partial(refused.complaint, planar.main)
+
+
 def numbers(folder):
     """What must not depend on how a run was cut into pieces."""
     motions = [json.loads((folder / "motions" / f"{k:02d}.json").read_text()) for k in range(2)]
     return [{key: value for key, value in motion.items() if key != "seconds"} for motion in motions]
 
 
-def test_a_killed_run_resumed_has_the_numbers_of_a_whole_one(photograph, tmp_path, capsys, complaint):
+def test_a_killed_run_resumed_has_the_numbers_of_a_whole_one(photograph, tmp_path, capsys):
     smoke = dict(image=photograph, smoke=True, pose="spline_reset")
     whole = planar.run(planar.Config(out=tmp_path / "whole", **smoke))
     assert {path.name for path in whole.folder.iterdir()} == FILES
@@ -278,7 +283,7 @@ def test_a_killed_run_resumed_has_the_numbers_of_a_whole_one(photograph, tmp_pat
     assert "SMOKE" in said.out and "2 motions" in said.out and str(out) in said.out
     assert numbers(out) == numbers(whole.folder)
 
-    line = complaint(planar.main, *again, "--seed", 1)
+    line = complaint(*again, "--seed", 1)
     assert "expected --seed 0, as it began, got 1" in line
 
     results = whole.results
@@ -343,18 +348,18 @@ def test_homographies(found_at_once, photograph, tmp_path):
         (["--image", "nowhere.png"], r"nowhere\.png"),
     ],
 )
-def test_bad_options_are_one_line(args, expected, tmp_path, complaint):
-    line = complaint(planar.main, *args, "--out", tmp_path / "out")
+def test_bad_options_are_one_line(args, expected, tmp_path):
+    line = complaint(*args, "--out", tmp_path / "out")
     assert line.startswith("planar: ")
     assert re.search(expected, line), line
     assert not (tmp_path / "out").exists()
 
 
-def test_resume_needs_to_know_what(complaint):
-    assert "--resume: expected --out DIR or --name NAME" in complaint(planar.main, "--resume")
+def test_resume_needs_to_know_what():
+    assert "--resume: expected --out DIR or --name NAME" in complaint("--resume")
 
 
-def test_bad_images_are_one_line(tmp_path, complaint):
+def test_bad_images_are_one_line(tmp_path):
     (tmp_path / "text.png").write_text("no image")
     Image.new("RGB", (40, 20)).save(tmp_path / "small.png")
     Image.new("RGB", (2000, 40)).save(tmp_path / "strip.png")
@@ -365,6 +370,6 @@ def test_bad_images_are_one_line(tmp_path, complaint):
     ):
         with pytest.raises(DataError, match=expected):
             planar_task.read_photo(tmp_path / name)
-    assert "small.png" in complaint(planar.main, "--image", tmp_path / "small.png", "--out", tmp_path / "out")
-    assert complaint(planar.main, "--image", tmp_path, "--out", tmp_path / "out").startswith("planar: ")
+    assert "small.png" in complaint("--image", tmp_path / "small.png", "--out", tmp_path / "out")
+    assert complaint("--image", tmp_path, "--out", tmp_path / "out").startswith("planar: ")
     assert not (tmp_path / "out").exists()

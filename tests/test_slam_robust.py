@@ -148,17 +148,19 @@ def sometimes(change):
 
 
 FAULTS = {
-    "70% of the pixels without depth": holes,
-    "70% of the image without depth": large_holes,
-    "black at times": sometimes(lambda frame: frame._replace(rgb=0 * frame.rgb)),
-    "saturated at times": sometimes(lambda frame: frame._replace(rgb=0 * frame.rgb + np.uint8(255))),
-    "nothing at times": sometimes(lambda frame: Frame(0 * frame.rgb, 0 * frame.depth)),
+    "70% of the pixels without depth": (holes, "none"),
+    "70% of the image without depth": (large_holes, "combined"),
+    "black at times": (sometimes(lambda frame: frame._replace(rgb=0 * frame.rgb)), "none"),
+    "saturated at times": (
+        sometimes(lambda frame: frame._replace(rgb=0 * frame.rgb + np.uint8(255))),
+        "combined",
+    ),
+    "nothing at times": (sometimes(lambda frame: Frame(0 * frame.rgb, 0 * frame.depth)), "combined"),
 }
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("imu", ["none", "combined"])
-@pytest.mark.parametrize("fault", FAULTS.values(), ids=FAULTS.keys())
+@pytest.mark.parametrize(("fault", "imu"), FAULTS.values(), ids=FAULTS.keys())
 def test_bad_frames_are_survived(walk, fault, imu):
     def read(i):
         return walk.read(i) if i == 0 else fault(walk.read(i), np.random.default_rng(i))

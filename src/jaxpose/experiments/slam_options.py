@@ -67,6 +67,8 @@ class Options:
             raise ValueError(f"--format {self.format}: expected --data DIR with it")
         if self.format == "room" and self.data is not None:
             raise ValueError(f"--format room: expected no --data, as the room is made; got {self.data}")
+        if self.room.along is not None and self.data is not None:
+            raise ValueError(f"--room.along: expected no --data with it, got {self.data}")
         _room_config(self)
 
 
@@ -108,9 +110,8 @@ def load(options: Options) -> Source:
     An IMU is simulated from the truth before frames are thinned, unless the recording has its own. Time
     starts at the first frame used. Raises DataError or OSError for what cannot be used.
     """
-    own_imu = options.room.along is not None
     if options.data is None:
-        name, recording = "room", room(_room_config(options))
+        name, recording, own_imu = "room", room(_room_config(options)), options.room.along is not None
         noise = options.room.imu_noise
         imu = f"{options.room.imu_rate_hz:g} Hz, exact derivatives of the room's path, {_sheet(noise)}"
     else:

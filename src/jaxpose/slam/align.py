@@ -112,8 +112,8 @@ def align(
     """The pose near a start that brings measured points onto the map's surface, by Gauss-Newton steps.
 
     Residuals count by their size, within one sigma by their square: by squares throughout, a camera between
-    furniture was lost. The predicted pose is a measurement too, with `sigma`
-    [m, rad]; against it the image counts as `_INDEPENDENT` pixels, since errors of a map go together.
+    furniture was lost. The predicted pose is a measurement too, with `sigma` [m, rad]; against it the image
+    counts as `_INDEPENDENT` pixels, since errors of a map go together.
     """
     prior = jnp.repeat(sigma, 3) ** -2
 
