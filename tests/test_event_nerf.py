@@ -1,17 +1,13 @@
 """The event command: what it starts from, its run folder, killed and resumed, what it refuses."""
 
-import json
 import re
-import signal
-import subprocess
-import sys
-import time
 from functools import partial
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import refused
+from killed import whole_and_killed
 from numpy.testing import assert_allclose, assert_array_equal
 
 from jaxpose import io, metrics, numpy_field
@@ -148,22 +144,9 @@ def test_a_study_puts_runs_side_by_side(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_sigkill_in_the_middle_changes_no_number(tmp_path):
-    """The real signal, to a process in the middle of its steps."""
-    args = "--image-width 16 --events 64 --steps 1000".split()
-    code = "from jaxpose.experiments import joint_loop as j, event_nerf as n; j._SAVE_EVERY_S = 0; n.main()"
-    start = lambda out: subprocess.Popen([sys.executable, "-c", code, *args, "--out", out, "--resume"])
-    assert start(tmp_path / "whole").wait() == 0
-    process, checkpoint = start(tmp_path / "cut"), tmp_path / "cut" / "checkpoint.npz"
-    while not checkpoint.exists():
-        time.sleep(0.02)
-    process.kill()
-    assert process.wait() == -signal.SIGKILL
-    with np.load(checkpoint) as file:
-        assert file[".state.step"] < 1000
-    assert start(tmp_path / "cut").wait() == 0
-    whole, cut = (json.loads((tmp_path / n / "results.json").read_text()) for n in ("whole", "cut"))
+    whole, killed = whole_and_killed("event_nerf", "--image-width 16 --events 64", 1000, tmp_path)
     for key in ("rotation_error_deg", "translation_error", "psnr", "ssim"):
-        assert cut[key] == whole[key]
+        assert killed[key] == whole[key]
 
 
 def test_the_correction_undoes_a_slope_and_an_offset_of_log_intensity():

@@ -2,10 +2,6 @@
 
 import json
 import re
-import signal
-import subprocess
-import sys
-import time
 from dataclasses import replace
 from functools import partial
 
@@ -14,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import refused
+from killed import whole_and_killed
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.interpolate import splrep
 
@@ -197,21 +194,9 @@ def build_three_chunks():
 
 @pytest.mark.slow
 def test_sigkill_in_the_middle_changes_no_number(tmp_path):
-    """The real signal, to a process in the middle of its steps."""
-    args = "--orbit-views 10 --image-width 24 --rays 256 --steps 1500 --settle-steps 2".split()
-    code = "from jaxpose.experiments import joint_loop as j, noisy_nerf as n; j._SAVE_EVERY_S = 0; n.main()"
-    start = lambda out: subprocess.Popen([sys.executable, "-c", code, *args, "--out", out, "--resume"])
-    assert start(tmp_path / "whole").wait() == 0
-    process, checkpoint = start(tmp_path / "cut"), tmp_path / "cut" / "checkpoint.npz"
-    while not checkpoint.exists():
-        time.sleep(0.02)
-    process.kill()
-    assert process.wait() == -signal.SIGKILL
-    with np.load(checkpoint) as file:
-        assert file[".state.step"] < 1500
-    assert start(tmp_path / "cut").wait() == 0
-    whole, cut = (json.loads((tmp_path / n / "results.json").read_text()) for n in ("whole", "cut"))
-    assert numbers(cut) == numbers(whole)
+    args = "--orbit-views 10 --image-width 24 --rays 256 --settle-steps 2"
+    whole, killed = whole_and_killed("noisy_nerf", args, 1500, tmp_path)
+    assert numbers(killed) == numbers(whole)
 
 
 def test_what_a_run_leaves(tmp_path):
