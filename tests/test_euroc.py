@@ -260,6 +260,7 @@ def test_frames_with_given_depth(vicon, walk, metres):
     for path in (vicon, vicon / "mav0"):
         recording = euroc.load(path)
         assert recording.name == vicon.name
+        assert [(path / file).is_file() for file in recording.files] == [True] * 6
     distortion = (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05)
     assert recording.camera == (20.5, 21.5, 15.25, 11.75, 32, 24, distortion)
     np.testing.assert_allclose(recording.t, np.arange(6) * 0.050000007, rtol=1e-12)

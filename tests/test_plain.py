@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from jaxpose.data import plain
@@ -38,6 +39,7 @@ def write_poses(folder, walk, kind):
 
 def test_images_read_back_in_order(desk, walk, metres):
     recording = plain.load(desk, rate_hz=10.0)
+    assert np.array_equal(np.asarray(Image.open(desk / recording.files[1])), recording.read(1).rgb)
     assert recording.name == "home/desk" and recording.T_world_cam is None and recording.imu is None
     assert recording.camera == (30, 31, 15.5, 11.5, 32, 24, ())
     np.testing.assert_allclose(recording.t, np.arange(6) / 10)

@@ -26,6 +26,7 @@ def room0(tmp_path, walk, save):
 
 def test_a_made_scene_reads_back(room0, walk, metres):
     recording = replica.load(room0, rate_hz=20.0)
+    assert [(room0 / file).is_file() for file in recording.files] == [True] * len(recording.t)
     assert recording.name == "Replica/room0" and recording.notes == () and recording.imu is None
     assert recording.camera == (30, 31, 15.5, 11.5, 32, 24, ())
     np.testing.assert_allclose(recording.t, np.arange(6) / 20)

@@ -30,6 +30,7 @@ def scene(tmp_path, walk, save):
 
 def test_a_made_scene_reads_back(scene, walk, metres):
     recording = scannet.load(scene, rate_hz=10.0)
+    assert [(scene / file).is_file() for file in recording.files] == [True] * len(recording.t)
     assert recording.name.endswith("/scene0000_00") and recording.imu is None
     assert recording.camera == (30, 31, 15.5, 11.5, 32, 24, ())
     np.testing.assert_allclose(recording.t, np.array(NUMBERS) / 10)

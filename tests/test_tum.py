@@ -4,6 +4,7 @@ import shutil
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from jaxpose.data import tum
@@ -47,6 +48,7 @@ def desk(tmp_path, walk, save):
 
 def test_a_made_sequence_reads_back(desk, walk, metres):
     recording = tum.load(desk)
+    assert np.array_equal(np.asarray(Image.open(desk / recording.files[1])), recording.read(1).rgb)
     used = [0, 1, 3, 4, 5]
     assert recording.name.endswith(f"/{LAYOUT}")
     assert recording.camera == (

@@ -19,7 +19,16 @@ from jaxpose.data.euroc_files import (
     seconds,
     sensors,
 )
-from jaxpose.data.images import check_depth, common_size, found, read_color, read_depth, some, usable_poses
+from jaxpose.data.images import (
+    check_depth,
+    common_size,
+    found,
+    read_color,
+    read_depth,
+    some,
+    usable_poses,
+    within,
+)
 from jaxpose.data.truth import poses_at
 from jaxpose.errors import DataError
 from jaxpose.imu import Imu, ImuNoise
@@ -106,6 +115,7 @@ def load(path: Path | str) -> Recording:
         T_body_cam=np.linalg.inv(log.T_body_imu) @ cam0.T_body_cam,
         notes=(*depth.notes, *lacking, *_unused(mav0)),
         t0=cam0.stamps_ns[rows[0]] * 1e-9,
+        files=within([cam0.files[row] for row in rows], path),
     )
 
 

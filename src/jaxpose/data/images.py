@@ -227,6 +227,11 @@ def only(candidates: Sequence[Path], path: Path, expected: str, kind: str = "fil
     raise DataError(f"{path}: expected {expected}, got {got}")
 
 
+def within(files: Sequence[Path], path: Path | str) -> tuple[str, ...]:
+    """Files by their names in the folder that the user named, as `Recording.files` has them."""
+    return tuple(str(file.relative_to(path)) for file in files)
+
+
 def name_of(folder: Path) -> str:
     """A recording's name: its folder and the one that holds it."""
     return f"{folder.resolve().parent.name}/{folder.resolve().name}"

@@ -28,6 +28,7 @@ from jaxpose.data.images import (
     read_intrinsics,
     some,
     usable_poses,
+    within,
 )
 from jaxpose.errors import DataError
 from jaxpose.io import nearest, read_kitti, read_numbers, read_tum
@@ -91,6 +92,7 @@ def load(path: Path | str, *, rate_hz: float = 30.0, depth_per_metre: float | No
         T_world_cam=poses,
         notes=(*paired, *assumed, *lacking),
         t0=float(t[rows[0]]),
+        files=within(colors, path),
     )
 
 

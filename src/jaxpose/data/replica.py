@@ -24,6 +24,7 @@ from jaxpose.data.images import (
     read_depth,
     some,
     usable_poses,
+    within,
 )
 from jaxpose.errors import DataError
 from jaxpose.io import read_numbers
@@ -73,6 +74,7 @@ def load(path: Path | str, *, rate_hz: float = 30.0) -> Recording:
         read=lambda i: Frame(read_color(colors[i]), read_depth(depths[i], per_metre)),
         T_world_cam=poses,
         notes=(*skipped, *assumed, *lacking),
+        files=within(colors, path),
     )
 
 

@@ -21,6 +21,7 @@ from jaxpose.data.images import (
     read_matrix,
     some,
     usable_poses,
+    within,
 )
 from jaxpose.errors import DataError
 from jaxpose.recording import Frame, Recording
@@ -74,6 +75,7 @@ def load(path: Path | str, *, rate_hz: float = 30.0) -> Recording:
         read=lambda i: Frame(read_color(colors[i], size), read_depth(depths[i])),
         T_world_cam=poses,
         notes=(*notes, *assumed, *unusable),
+        files=within(colors, path),
     )
 
 

@@ -25,6 +25,7 @@ from jaxpose.data.images import (
     read_matrix,
     some,
     usable_poses,
+    within,
 )
 from jaxpose.errors import DataError
 from jaxpose.recording import Frame, Recording
@@ -73,7 +74,7 @@ def load(path: Path | str, *, rate_hz: float = 30.0) -> Recording:
         read=lambda i: Frame(read_color(frames[i].color), read_depth(frames[i].depth)),
         T_world_cam=poses,
         notes=(*skipped, *assumed, *repaired),
-        files=tuple(str(frame.color.relative_to(path)) for frame in frames),
+        files=within([frame.color for frame in frames], path),
     )
 
 

@@ -23,6 +23,7 @@ from jaxpose.data.images import (
     read_intrinsics,
     some,
     usable_poses,
+    within,
 )
 from jaxpose.errors import DataError
 from jaxpose.io import nearest
@@ -90,6 +91,7 @@ def load(path: Path | str, *, max_difference_s: float = 0.02, depth_per_metre: f
         T_world_cam=poses,
         notes=tuple(notes),
         t0=float(stamps[0]),
+        files=within(colors, path),
     )
 
 

@@ -62,6 +62,11 @@ class Options:
                 raise ValueError(f"--{option.replace('_', '-')}: expected a positive number, got {value}")
         if not math.isfinite(self.imu_offset_s):
             raise ValueError(f"--imu-offset-s: expected a finite number, got {self.imu_offset_s}")
+        if (self.imu_filter or self.imu_offset_s) and self.data is None and self.room.along is None:
+            option = "--imu-filter" if self.imu_filter else "--imu-offset-s"
+            raise ValueError(
+                f"{option}: expected --data or --room.along DIR with an IMU of its own, got neither"
+            )
         if (self.imu_file is None) != (self.imu_extrinsics is None):
             given, other = ("file", "extrinsics") if self.imu_file else ("extrinsics", "file")
             raise ValueError(f"--imu-{given}: expected --imu-{other} FILE with it, got none")

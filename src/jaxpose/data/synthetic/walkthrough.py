@@ -13,7 +13,7 @@ from jaxpose.camera import Camera, pixel_direction
 from jaxpose.data.synthetic import hand, sensor
 from jaxpose.data.synthetic.atlas import Atlas, bake, gather, look_up
 from jaxpose.data.synthetic.drive import Drive, by_hand, recorded
-from jaxpose.data.synthetic.furniture import furnish
+from jaxpose.data.synthetic.furniture import Extent, furnish
 from jaxpose.data.synthetic.shapes import Shapes, cast, locate, within_cone
 from jaxpose.imu import ADIS16448, GRAVITY_WORLD, ImuNoise
 from jaxpose.recording import Frame, Recording
@@ -54,10 +54,8 @@ def room(config: RoomConfig = RoomConfig()) -> Recording:
     The world is z-up with its origin on the floor; the body is the IMU, its axes forwards, left, up. With
     `config.along` it is a recorded motion with its readings (`drive.recorded`), the room as large as needed.
     """
-    palette, brush, path = np.random.default_rng(config.seed).spawn(3)
-    drive = _drive(config, path)
-    pieces, shapes = gather(furnish(palette, drive.room))
-    atlas = bake(pieces, shapes, brush)
+    drive = _drive(config)
+    shapes, atlas = _scenery(config.seed, drive.room)
     focal = 585 / 640 * config.width  # Kinect's angle of view
     centre = (config.width - 1) / 2, (config.height - 1) / 2
     camera = Camera(focal, focal, *centre, config.width, config.height)
@@ -80,10 +78,19 @@ def room(config: RoomConfig = RoomConfig()) -> Recording:
     )  # fmt: skip
 
 
-def _drive(config: RoomConfig, path: np.random.Generator) -> Drive:
+@lru_cache(maxsize=2)
+def _scenery(seed: int, size: Extent) -> tuple[Shapes, Atlas]:
+    """What stands in a room of this size, with paint and light: seconds of work, the same for every walk."""
+    palette, brush, _ = np.random.default_rng(seed).spawn(3)
+    pieces, shapes = gather(furnish(palette, size))
+    return shapes, bake(pieces, shapes, brush)
+
+
+def _drive(config: RoomConfig) -> Drive:
     if config.along is not None:
         return recorded(config.along, config.duration_s, config.rate_hz)
     t = np.arange(int(np.floor(config.duration_s * config.rate_hz + 1e-9)) + 1) / config.rate_hz
+    *_, path = np.random.default_rng(config.seed).spawn(3)
     walk = hand.draw(path, config.speed)
     return by_hand(walk, t, config.imu_rate_hz, config.imu_noise, config.gravity_world, seed=config.seed)
 
