@@ -4,37 +4,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from box import box_pixels, inside_of_a_box
 
 from jaxpose import metrics, se3
 from jaxpose.data.synthetic import RoomConfig, room
 from jaxpose.recording import Frame, Recording, select
 from jaxpose.slam.keyframes import look
 from jaxpose.slam.localise import _bent
-from jaxpose.slam.mapping import Nearby
-from jaxpose.slam.observe import Pixels
 from jaxpose.slam.run import SlamConfig, run
 from jaxpose.slam.search import CENTRES, search
 from jaxpose.slam.state import no_frames
 
 BAND = 0.3
-LOWER, UPPER = np.float32([-2, -1.5, -1]), np.float32([2, 1.5, 3])
 
 
 def truncated_box(point):
-    """A room with three pairs of walls, as a map knows it: distances up to a band, colour by place."""
-    distance = jnp.min(jnp.concatenate([point - LOWER, UPPER - point]))
-    known = (jnp.abs(distance) < BAND).astype(distance.dtype)
-    return Nearby(distance, 0.5 + 0.4 * jnp.sin(3 * point), known)
-
-
-def box_pixels(T_world_cam, count=400):
-    """Exact depth and colour of the box at random pixels."""
-    rng = np.random.default_rng(0)
-    ray = np.concatenate([rng.uniform(-0.6, 0.6, (count, 2)), np.ones((count, 1))], axis=1)
-    direction, origin = ray @ T_world_cam[:3, :3].T, T_world_cam[:3, 3]
-    depth = np.min(np.where(direction > 0, UPPER - origin, LOWER - origin) / direction, axis=1)
-    points = origin + depth[:, None] * direction
-    return Pixels(*(jnp.asarray(x, jnp.float32) for x in (ray, depth, 0.5 + 0.4 * np.sin(3 * points))))
+    """The box as a map knows it: distances up to a band."""
+    near = inside_of_a_box(point)
+    return near._replace(known=(jnp.abs(near.distance) < BAND).astype(near.distance.dtype))
 
 
 def off(T, truth):
@@ -53,7 +40,7 @@ def test_a_search_finds_a_camera_that_prediction_missed(find, seed):
     truth = np.asarray(se3.exp(jnp.array([0.1, -0.2, 0.3, 0.2, 0.1, -0.1])))
     start = se3.compose(jnp.asarray(truth), se3.exp(jnp.array([0.2, -0.15, 0.1, 0.15, -0.1, 0.2])))
     centres = jnp.tile(start[None], (CENTRES, 1, 1))
-    found = find(centres, jnp.array([0.25, 0.25]), box_pixels(truth), jax.random.key(seed))
+    found = find(centres, jnp.array([0.25, 0.25]), box_pixels(truth, 400), jax.random.key(seed))
     metres, radians = off(found, truth)
     assert off(start, truth)[0] > 0.25 and metres < 0.2 and radians < 0.1  # near enough to be aligned
 
@@ -62,7 +49,7 @@ def test_a_search_begins_at_every_centre(find):
     truth = np.asarray(se3.exp(jnp.array([0.5, -0.2, 0.3, 0.2, 1.0, -0.1])))
     away = [se3.exp(jnp.array([0.1 * k, 0.0, 0.0, 0.0, -0.05 * k, 0.0])) for k in range(CENTRES - 1)]
     near = se3.compose(jnp.asarray(truth), se3.exp(jnp.array([0.05, -0.05, 0.1, 0.05, -0.1, 0.02])))
-    found = find(jnp.stack([*away, near]), jnp.array([0.2, 0.2]), box_pixels(truth), jax.random.key(1))
+    found = find(jnp.stack([*away, near]), jnp.array([0.2, 0.2]), box_pixels(truth, 400), jax.random.key(1))
     metres, radians = off(found, truth)
     assert metres < 0.08 and radians < 0.05
 

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from box import UPPER, box_pixels, inside_of_a_box
 from scipy.spatial.transform import Rotation
 
 from jaxpose import se3
@@ -14,9 +15,7 @@ from jaxpose.imu import Imu
 from jaxpose.recording import Frame, Recording
 from jaxpose.slam.align import align, best_start, starts, surface_residuals
 from jaxpose.slam.frames import gauge, make_field
-from jaxpose.slam.mapping import Nearby
 from jaxpose.slam.objective import TrackConfig
-from jaxpose.slam.observe import Pixels
 from jaxpose.slam.predict import (
     GYRO_BIAS_SIGMA,
     end_velocity,
@@ -30,14 +29,6 @@ from jaxpose.slam.predict import (
 from jaxpose.slam.run import SlamConfig, run
 
 SMALL = PoseNetConfig(layers=3, width=32, activation="softplus")
-LOWER, UPPER = np.float32([-2, -1.5, -1]), np.float32([2, 1.5, 3])
-
-
-def inside_of_a_box(point):
-    """A room with three pairs of walls, coloured by place."""
-    lower, upper = LOWER.astype(point.dtype), UPPER.astype(point.dtype)
-    distance = jnp.min(jnp.concatenate([point - lower, upper - point]))
-    return Nearby(distance, 0.5 + 0.4 * jnp.sin(3 * point), jnp.ones_like(distance))
 
 
 def one_wall(point):
@@ -45,20 +36,10 @@ def one_wall(point):
     return inside_of_a_box(point)._replace(distance=float(UPPER[2]) - point[2])
 
 
-def box_pixels(T_world_cam, count=300):
-    """Exact depth and colour of the box at random pixels."""
-    rng = np.random.default_rng(0)
-    ray = np.concatenate([rng.uniform(-0.6, 0.6, (count, 2)), np.ones((count, 1))], axis=1)
-    direction, origin = ray @ T_world_cam[:3, :3].T, T_world_cam[:3, 3]
-    depth = np.min(np.where(direction > 0, UPPER - origin, LOWER - origin) / direction, axis=1)
-    points = origin + depth[:, None] * direction
-    return Pixels(*(jnp.asarray(x, jnp.float32) for x in (ray, depth, 0.5 + 0.4 * np.sin(3 * points))))
-
-
 def test_alignment_finds_the_camera_in_a_closed_form_room():
     truth = np.asarray(se3.exp(jnp.array([0.1, -0.2, 0.3, 0.2, 0.1, -0.1])))
     start = se3.compose(jnp.asarray(truth), se3.exp(jnp.array([0.08, -0.06, 0.05, 0.05, -0.04, 0.06])))
-    pixels, config = box_pixels(truth), TrackConfig()
+    pixels, config = box_pixels(truth, 300), TrackConfig()
     wide = jnp.array([0.5, 0.5])
     found = jax.jit(lambda T: align(inside_of_a_box, T, T, wide, pixels, config))(start)
     error = se3.log(se3.compose(se3.inverse(found.T_world_cam), jnp.asarray(truth)))
@@ -71,7 +52,7 @@ def test_alignment_finds_the_camera_in_a_closed_form_room():
 def test_slopes_of_the_residuals_are_those_of_finite_differences():
     """On a map whose distance is not of slope 1, which is set right, and against moved poses."""
     T = se3.exp(jnp.array([0.1, -0.2, 0.3, 0.2, 0.1, -0.1]))
-    pixels = box_pixels(np.asarray(T))
+    pixels = box_pixels(np.asarray(T), 300)
     twice = lambda point: (near := inside_of_a_box(point))._replace(distance=2 * near.distance)
     with jax.enable_x64(True):
         T, pixels = jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), (T, pixels))
@@ -98,7 +79,7 @@ def test_slopes_of_the_residuals_are_those_of_finite_differences():
 def test_colour_finds_what_a_single_wall_does_not_say():
     truth = np.eye(4)
     start = se3.exp(jnp.array([0.03, -0.02, 0.02, 0.01, 0.0, 0.02]))
-    pixels = box_pixels(truth)
+    pixels = box_pixels(truth, 300)
     ahead = jnp.abs(pixels.depth - UPPER[2]) < 1e-3
     pixels = jax.tree.map(lambda x: x[ahead], pixels)
     found = {
@@ -115,7 +96,7 @@ def test_a_sharp_prediction_holds_the_pose_against_the_image():
     truth = np.eye(4)
     start = se3.exp(jnp.array([0.03, 0.0, 0.0, 0.0, 0.0, 0.0]))
     sharp = jnp.array([1e-6, 1e-6])
-    run_align = jax.jit(lambda T: align(inside_of_a_box, T, T, sharp, box_pixels(truth), TrackConfig()))
+    run_align = jax.jit(lambda T: align(inside_of_a_box, T, T, sharp, box_pixels(truth, 300), TrackConfig()))
     assert jnp.abs(run_align(start).T_world_cam - start).max() < 1e-4
 
 
@@ -124,7 +105,7 @@ def test_the_best_start_is_the_one_that_explains_the_image():
     tries = starts(jnp.asarray(truth), jnp.array([0.1, 0.1]))
     assert tries.shape == (13, 4, 4)
     order = jnp.roll(tries, 5, axis=0)
-    chosen = best_start(inside_of_a_box, order, box_pixels(truth))
+    chosen = best_start(inside_of_a_box, order, box_pixels(truth, 300))
     assert jnp.array_equal(chosen, jnp.asarray(truth))
 
 

@@ -197,7 +197,8 @@ def _searched(
         angle = rotation_angle_deg(away[:, :3, :3], np.tile(np.eye(3), (len(kept), 1, 1)))
         off = np.stack([np.linalg.norm(away[:, :3, 3], axis=1), np.deg2rad(angle)], axis=1)
         kept = kept[(off <= 3 * reach).all(axis=1)]
-        unlike = [np.mean((system.look(k) - look(frame)) ** 2) for k in kept.tolist()]
+        seen = look(frame)
+        unlike = [np.mean((system.look(k) - seen) ** 2) for k in kept.tolist()]
         centres += list(frames.T_world_body[kept[np.argsort(unlike)[: CENTRES - 1]]])
     spread = np.where(np.isfinite(reach), reach, _AROUND_CENTRES)
     found = system.world(state.grid).search(
