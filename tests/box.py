@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from jaxpose.slam.mapping import Nearby
+from jaxpose.slam.fuse import Nearby
 from jaxpose.slam.observe import Pixels
 
 LOWER, UPPER = np.float32([-2, -1.5, -1]), np.float32([2, 1.5, 3])

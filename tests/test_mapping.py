@@ -10,7 +10,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from jaxpose.camera import Camera
 from jaxpose.scenes import GridConfig, grid, merge, node_positions
-from jaxpose.slam.mapping import MapConfig, look_up, make_descend, make_fuse
+from jaxpose.slam.fuse import look_up, make_fuse
+from jaxpose.slam.mapping import MapConfig, make_descend
 from jaxpose.slam.observe import Image, SampleConfig
 
 CAMERA = Camera(60.0, 60.0, 31.5, 23.5, 64, 48)

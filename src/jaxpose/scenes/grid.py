@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxpose.scenes.base import Params, SceneField
 
@@ -106,6 +106,11 @@ def grow(config: GridConfig, state: Any, points: np.ndarray) -> tuple[GridConfig
     old = pad(jnp.ones_like(state.params[0])) > 0
     coarse = jnp.where(old, larger.params[0], jnp.broadcast_to(_free(config), old.shape))
     return config, larger._replace(params=(coarse, *larger.params[1:]))
+
+
+def node_shape(config: GridConfig) -> Int[np.ndarray, "3"]:
+    """How many nodes the finest level has along x, y and z."""
+    return _coarse_cells(config) * RATIO ** (config.levels - 1) + 1
 
 
 def node_axes(config: GridConfig) -> tuple[Float[np.ndarray, " n"], ...]:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxpose import se3
-from jaxpose.slam.mapping import Lookup
+from jaxpose.slam.fuse import Lookup
 from jaxpose.slam.objective import Residuals, TrackConfig, image_loss, median
 from jaxpose.slam.observe import Pixels, back_project, depth_sigma
 

@@ -1,17 +1,8 @@
-"""Mapping: what a frame with a known pose adds to the scene.
+"""Mapping as in the paper: the scene is optimised on rays of the current frame and of keyframes beside it.
 
-Two ways. `gradient` is the paper's: the scene is optimised on rays of the current frame and of keyframes that
-see the same place. `fused` solves for the signed distance in closed form: at every node of the grid the
-weighted mean of all distances measured along the optical axis, which is what the gradient's L2 loss tends to
-when every frame is seen equally often (Curless and Levoy 1996). It has no step size, forgets nothing and
-costs one pass over the grid; the figures of both are in experiments/.
-
-The scene's distance is cut off close behind surfaces, as thin things have two sides. Beside it the fused map
-has a second one that reaches farther to both sides, and keeps where anything was measured: a camera is
-aligned to that one (`look_up`), from farther off.
+`fuse.py` is the other way, and the default.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal, NamedTuple
@@ -24,20 +15,9 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from jaxpose.camera import Camera
 from jaxpose.losses import weighted_mean
 from jaxpose.render import Ray, composite, sdf_weights
-from jaxpose.scenes import GridConfig, SceneField, node_axes
+from jaxpose.scenes import SceneField
 from jaxpose.scenes.base import Params
-from jaxpose.scenes.grid import trilinear
-from jaxpose.slam.observe import (
-    Image,
-    SampleConfig,
-    depth_sigma,
-    locate,
-    sample_depths,
-    sample_pixels,
-)
-
-_MEMORY = 100.0  # frames, at a depth of one metre: older ones are slowly forgotten
-_REACH = 8  # voxels to either side of a surface of which the wide distance knows
+from jaxpose.slam.observe import Image, SampleConfig, depth_sigma, sample_depths, sample_pixels
 
 
 @dataclass(frozen=True)
@@ -60,75 +40,6 @@ class MapState(NamedTuple):
 
     params: Params
     memory: Any
-
-
-class Nearby(NamedTuple):
-    """What a map says about a point: signed distance [m] to the surface, colour there, 1 where it knows."""
-
-    distance: Float[Array, ""]
-    rgb: Float[Array, "3"]
-    known: Float[Array, ""]
-
-
-Lookup = Callable[[Float[Array, "3"]], Nearby]
-
-
-def make_fuse(config: GridConfig, camera: Camera, band: float):
-    """`init(params)` and the compiled step `update(state, image, T_world_cam)` of closed-form mapping.
-
-    `band` [m] is how far behind a surface a distance of the scene still counts as measured. The memory
-    (x, y, z, 5) holds the weights of distance, colour and wide distance, then the wide distance [m] and 1
-    where it is known.
-    """
-    x, y, z = (jnp.asarray(axis) for axis in node_axes(config))
-    reach = _REACH * config.voxel
-
-    @partial(jax.jit, donate_argnums=0)
-    def update(state: MapState, image: Image, T_world_cam: Float[Array, "4 4"]) -> MapState:
-        def slice_at(item):
-            values, memory, x = item
-            weight, wide, known = memory[..., :3], memory[..., 3], memory[..., 4]
-            nodes = jnp.stack(jnp.broadcast_arrays(x, y[:, None], z[None, :]), axis=-1)
-            at = locate(camera, T_world_cam, nodes)
-            depth = image.depth[at.row, at.column]
-            distance = depth - at.depth
-            near = (depth_sigma(jnp.ones(())) / depth_sigma(depth)) ** 2
-            worth = jnp.where(at.inside & (depth > 0), near, 0)
-            gain = jnp.stack([
-                jnp.where(distance > -band, worth, 0),
-                jnp.where(jnp.abs(distance) < band, worth, 0),
-                jnp.where(distance > -reach, worth, 0),
-            ], axis=-1)  # fmt: skip
-            total = weight + gain
-            share = gain / jnp.where(total > 0, total, 1)
-            rgb = image.rgb[at.row, at.column].astype(values.dtype) / 255
-            measured = jnp.concatenate([jnp.minimum(distance, band)[..., None], rgb], axis=-1)
-            values = values + share[..., jnp.array([0, 1, 1, 1])] * (measured - values)
-            wide = wide + share[..., 2] * (jnp.minimum(distance, reach) - wide)
-            known = jnp.where(gain[..., 2] > 0, 1, known)
-            memory = [jnp.minimum(total, _MEMORY), wide[..., None], known[..., None]]
-            return values, jnp.concatenate(memory, axis=-1)
-
-        # One slice of the grid after the other: what is in between stays small, whatever the map's size.
-        values, memory = jax.lax.map(slice_at, (state.params[0], state.memory, x))
-        return MapState((values,), memory)
-
-    return lambda params: MapState(params, jnp.zeros((*params[0].shape[:3], 5))), update
-
-
-def look_up(
-    scene: SceneField, config: GridConfig, wide: bool, params: Params, memory: Any, point: Float[Array, "3"]
-) -> Nearby:
-    """A point in a map: by the wide distance in a fused map's memory, or by the scene's own."""
-    distance, rgb = scene.query(params, point, jnp.zeros(3, point.dtype))
-    reach = config.truncation
-    known = jnp.ones_like(distance)
-    if wide:
-        position = (point - jnp.asarray(config.lower, point.dtype)) / config.voxel
-        *_, distance, known = trilinear(memory, position)
-        reach = _REACH * config.voxel
-    measured = (known > 1 - 1e-3) & (jnp.abs(distance) < 0.98 * reach)
-    return Nearby(distance, rgb, measured.astype(distance.dtype))
 
 
 def make_descend(scene: SceneField, camera: Camera, config: MapConfig):

@@ -29,7 +29,7 @@ class Pixels(NamedTuple):
 
 
 class Located(NamedTuple):
-    """World points as an image has them: their depth [m] and nearest pixel, (0, 0) where it is not inside."""
+    """Points as an image has them: their depth [m] and nearest pixel, (0, 0) where it is not inside."""
 
     depth: Float[Array, "*n"]
     row: Int[Array, "*n"]
@@ -95,9 +95,8 @@ def render_pixels(
     return jax.vmap(lambda r, d: render.render_ray(query, r, d, weights=weights))(ray, depths)
 
 
-def locate(camera: Camera, T_world_cam: Float[Array, "4 4"], points: Float[Array, "*n 3"]) -> Located:
-    """Where an image taken from a pose has points of the world [m]."""
-    point_cam = se3.apply(se3.inverse(T_world_cam), points)
+def locate(camera: Camera, point_cam: Float[Array, "*n 3"]) -> Located:
+    """Where an image has points in camera axes [m]."""
     pixel = jnp.round(project(camera, point_cam))
     column, row = pixel[..., 0], pixel[..., 1]
     inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)

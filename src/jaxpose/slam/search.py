@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxpose import se3
-from jaxpose.slam.mapping import Lookup
+from jaxpose.slam.fuse import Lookup
 from jaxpose.slam.observe import Pixels, back_project
 
 FOUND_SIGMA = (0.04, 0.03)  # [m, rad] how far off the pose that a search finds may be

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from scipy.ndimage import map_coordinates
 
+from jaxpose import se3
 from jaxpose.camera import Camera
 from jaxpose.scenes import GridConfig
 from jaxpose.slam.keyframes import Keyframe
@@ -79,7 +80,7 @@ def _seen(
 
     @jax.jit
     def by(points, image, T_world_cam):
-        at = locate(camera, T_world_cam, points)
+        at = locate(camera, se3.apply(se3.inverse(T_world_cam), points))
         depth = image.depth[at.row, at.column]
         return at.inside & (depth > 0) & (jnp.abs(depth - at.depth) < band)
 

@@ -22,7 +22,7 @@ from jaxpose.imu import ResidualSigmas
 from jaxpose.scenes import SceneField
 from jaxpose.slam.align import align, best_start, pose_sigma, starts
 from jaxpose.slam.frames import Framed, Gauge, Motion
-from jaxpose.slam.mapping import Nearby
+from jaxpose.slam.fuse import Nearby
 from jaxpose.slam.objective import ImuWeights, TrackConfig, image_loss, image_residuals, imu_loss
 from jaxpose.slam.observe import sample_pixels
 from jaxpose.slam.predict import AHEAD, Interval
