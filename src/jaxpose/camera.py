@@ -1,5 +1,6 @@
 """The pinhole camera with OpenCV's lens distortion: pixels to rays and points to pixels."""
 
+import math
 from typing import NamedTuple
 
 import jax
@@ -49,6 +50,11 @@ def project(camera: Camera, point_cam: Float[Array, "*n 3"]) -> Float[Array, "*n
         [distorted[..., 0] * camera.fx + camera.cx, distorted[..., 1] * camera.fy + camera.cy], axis=-1
     )
     return jnp.where(seen, pixel, _OUTSIDE)
+
+
+def angle_of_view(camera: Camera) -> float:
+    """The horizontal angle of view [rad] of the pinhole."""
+    return 2 * math.atan(camera.width / 2 / camera.fx)
 
 
 def scale(camera: Camera, factor: float) -> Camera:

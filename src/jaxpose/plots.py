@@ -6,13 +6,14 @@ from typing import Any, NamedTuple
 
 import matplotlib
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import NullFormatter
+from scipy.ndimage import uniform_filter1d
 
 from jaxpose.io import atomic
 
@@ -227,6 +228,33 @@ def comparison(
         bars.margins(x=0.18)
         bars.set(xlabel="ATE-RMSE [cm]")
         bars.grid(False)
+        figure.suptitle(title)
+        _save(figure, path)
+
+
+def freedom(
+    path: Path | str,
+    t: Float[np.ndarray, " n"],
+    before: Int[np.ndarray, " n"],
+    after: Int[np.ndarray, " n"],
+    title: str,
+) -> None:
+    """Degrees of freedom over time, before and after, as means of ten motions, and how often each occurs."""
+    with matplotlib.rc_context(_STYLE):
+        figure = Figure(figsize=(11, 3.6), dpi=DPI, layout="constrained")
+        curves, bars = figure.subplots(1, 2, width_ratios=(2.4, 1))
+        for k, (name, dof, colour) in enumerate((
+            ("frame to frame", before, TRUTH),
+            ("intrinsic frame", after, ESTIMATE),
+        )):  # fmt: skip
+            label = f"{name}, mean {dof.mean():.2f}"
+            curves.plot(t, dof, color=colour, lw=0, marker=".", ms=3, alpha=0.5)
+            curves.plot(t, uniform_filter1d(dof.astype(float), 10), color=colour, lw=1.6, label=label)
+            share = np.bincount(dof, minlength=7) / len(dof)
+            bars.bar(np.arange(7) + 0.4 * k - 0.2, share, width=0.4, color=colour)
+        curves.set(xlabel="time [s]", ylabel="degrees of freedom", ylim=(-0.2, 6.2), xlim=(t[0], t[-1]))
+        curves.legend(loc="best", ncols=2)
+        bars.set(xlabel="degrees of freedom", ylabel="share of motions")
         figure.suptitle(title)
         _save(figure, path)
 

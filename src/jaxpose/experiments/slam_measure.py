@@ -6,12 +6,14 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxpose import metrics
+from jaxpose.camera import angle_of_view
 from jaxpose.errors import DataError
 from jaxpose.fields import body_to_camera
 from jaxpose.imu import Imu, remove_gravity
+from jaxpose.intrinsic import THRESHOLD, effective_dof
 from jaxpose.motion import motion
 from jaxpose.recording import Recording
 from jaxpose.slam.run import SlamResult
@@ -27,6 +29,14 @@ class Inertial(NamedTuple):
     accelerometer: tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]]  # m/s^2, free of gravity
     gyro_rms: float
     accelerometer_rms: float
+
+
+class Freedom(NamedTuple):
+    """Degrees of freedom of each motion from frame to frame: the body's own, and in the intrinsic frame."""
+
+    before: Int[np.ndarray, " n"]
+    after: Int[np.ndarray, " n"]
+    numbers: dict[str, Any]
 
 
 class Accuracy(NamedTuple):
@@ -56,6 +66,18 @@ def cost(result: SlamResult) -> dict[str, Any]:
         "field_rmse_m": result.field_rmse_m,
         "field_rmse_deg": result.field_rmse_deg,
     }
+
+
+def freedom(recording: Recording, result: SlamResult) -> Freedom | None:
+    """The effective degrees of freedom before and after (paper figure 6); None but for `intrinsic`."""
+    if not np.isfinite(result.T_inner[1:]).all():
+        return None
+    T_world_body = result.T_world_cam @ np.linalg.inv(recording.T_body_cam)
+    view = angle_of_view(recording.camera)
+    motions = (np.linalg.inv(T_world_body[:-1]) @ T_world_body[1:], result.T_inner[1:])
+    before, after = (np.asarray(effective_dof(jnp.asarray(motion, jnp.float32), view)) for motion in motions)
+    numbers = {"threshold": THRESHOLD, "before_mean": float(before.mean()), "after_mean": float(after.mean())}
+    return Freedom(before, after, numbers)
 
 
 def _medians(sigma: Float[np.ndarray, "n 2"]) -> dict[str, float]:

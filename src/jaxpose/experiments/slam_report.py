@@ -90,6 +90,13 @@ def report(folder: Path, results: dict[str, Any]) -> str:
             "RMSE to the tracked poses",
         ),
     ]
+    if "degrees_of_freedom" in results:
+        dof = results["degrees_of_freedom"]
+        lines.append(_line(
+            "effective DOF",
+            f"{dof['before_mean']:.2f}, {dof['after_mean']:.2f} in the intrinsic frame  "
+            f"components of [2 alpha / gamma, v / |v|] above {dof['threshold']:g}, mean of all motions",
+        ))  # fmt: skip
     lines += _map(results["map"])
     return "\n".join(lines + _ending(folder, results, results["notes"], "trajectory.png"))
 

@@ -18,7 +18,7 @@ from jaxpose.errors import DataError
 from jaxpose.experiments import slam_checkpoint
 from jaxpose.experiments.slam_keep import keeper
 from jaxpose.experiments.slam_map import Renderer, SavedMap, map_quality, renderer, views, write_map
-from jaxpose.experiments.slam_measure import Accuracy, Inertial, accuracy, cost, inertial
+from jaxpose.experiments.slam_measure import Accuracy, Inertial, accuracy, cost, freedom, inertial
 from jaxpose.experiments.slam_options import Options, Source, decisive, load, slam_config
 from jaxpose.experiments.slam_report import table
 from jaxpose.fields import Params, PoseField, bspline
@@ -135,6 +135,11 @@ def _single(
         "smoke": options.smoke,
         **cost(result),
     }
+    few = freedom(recording, result)
+    if few is not None:
+        results |= {"degrees_of_freedom": few.numbers}
+        title = f"{recording.name}: motion from frame to frame, before and in the intrinsic frame"
+        plots.freedom(folder / "freedom.png", recording.t[1:], few.before, few.after, title)
     if errors is not None:
         results |= errors.numbers
     if motion is not None:

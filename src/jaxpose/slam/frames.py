@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Literal, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -33,12 +34,14 @@ class Framed(NamedTuple):
     """A field in a frame of reference.
 
     `motion` is the body's since the last frame. `direct` is the same without the anchor: equal to it where
-    the field is the identity at the last frame, and without the anchor's freedom of gauge.
+    the field is the identity at the last frame, and without the anchor's freedom of gauge. `parts` are the
+    outer and the inner field of the frame `intrinsic`.
     """
 
     field: PoseField
     motion: Motion
     direct: Motion
+    parts: tuple[PoseField, PoseField] | None = None
 
 
 def make_field(name: FrameName, config: PoseNetConfig, interval_s: float, duration_s: float) -> Framed:
@@ -58,12 +61,21 @@ def make_field(name: FrameName, config: PoseNetConfig, interval_s: float, durati
         return Framed(field, motion, lambda params, gauge: lambda t: field.pose(params, t))
 
     net = posenet(replace(config, span=(0.0, duration_s)))
-    field = intrinsic(net, net) if name == "intrinsic" else net
+    field = _held(intrinsic(net, net)) if name == "intrinsic" else net
 
     def motion_in_frame(params, gauge):
         return in_frame(lambda t: field.pose(params, t + gauge.clock), gauge.T_ref_field)
 
-    return Framed(field, motion_in_frame, motion_in_frame)
+    return Framed(field, motion_in_frame, motion_in_frame, (net, net) if name == "intrinsic" else None)
+
+
+def _held(field: PoseField) -> PoseField:
+    """An intrinsic field whose outer part stays as it is: only `reframe.py` changes it."""
+
+    def pose(params, t):
+        return field.pose(params | {"outer": jax.lax.stop_gradient(params["outer"])}, t)
+
+    return PoseField(field.init, pose)
 
 
 def gauge(

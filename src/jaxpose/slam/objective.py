@@ -35,6 +35,7 @@ class TrackConfig:
     decay: float = 0.1  # of both rates over the iterations
     field_steps: int = 60  # Adam steps of bringing the field to the motion that is predicted or found
     colour_weight: float = 0.1  # of the colour residual against the depth residual, both in sigmas
+    dof_weight: float = 0.1  # of L_dof, in the frame intrinsic under `gradient`
     minimum_valid: float = 0.2  # share of the pixels the map must explain
     sample: SampleConfig = SampleConfig()
 

@@ -17,6 +17,7 @@ from jaxpose.slam.config import ImuMode, SlamConfig
 from jaxpose.slam.localise import next_pose
 from jaxpose.slam.observe import Image
 from jaxpose.slam.predict import GYRO_BIAS_SIGMA
+from jaxpose.slam.reframe import Refit, due, window
 from jaxpose.slam.state import SlamState, no_frames
 from jaxpose.slam.system import System, make_system
 from jaxpose.slam.world import first_grid, map_frame, room_for, scene_params, seen_points
@@ -40,6 +41,7 @@ class SlamResult(NamedTuple):
     """A tracked recording."""
 
     T_world_cam: np.ndarray  # (n, 4, 4)
+    T_inner: np.ndarray  # (n, 4, 4) the body's motion since the last frame, in the frame `intrinsic`
     lost: np.ndarray  # (n,) bool: tracking failed, the pose is the prediction
     uncertain: np.ndarray  # (n,) bool: lost, reckoned from the IMU, or little in the image to hold on to
     mapped: np.ndarray  # (n,) bool: the map was made from it
@@ -110,6 +112,8 @@ def step(system: System, state: SlamState, frame: Frame) -> SlamState:
     image = Image(jnp.asarray(frame.rgb), jnp.asarray(frame.depth, jnp.float32))
     if i > 0:
         state = next_pose(system, state, frame, image, generator, track_key)
+    if system.refit is not None and due(i, len(recording.t)):
+        state = _reframed(system.refit, state, recording.t, i)
     state = state._replace(done=i + 1, key=key)
     T_world_cam = state.frames.T_world_body[i] @ recording.T_body_cam
     points = seen_points(frame, recording, T_world_cam)
@@ -119,6 +123,16 @@ def step(system: System, state: SlamState, frame: Frame) -> SlamState:
     state = state._replace(far=max(state.far, 1.2 * float(np.percentile(away, 99))))
     state = room_for(points, state)
     return map_frame(system.world(state.grid), recording, config, state, image, points, generator, map_key)
+
+
+def _reframed(refit: Refit, state: SlamState, t: Float[np.ndarray, " n"], i: int) -> SlamState:
+    """The state with the intrinsic frame brought to the motions up to frame i."""
+    chosen, poses = window(i), state.frames.T_world_body
+    motions = np.linalg.inv(poses[chosen - 1]) @ poses[chosen]
+    params, T_inner = refit(
+        state.params, jnp.asarray(t[chosen] - t[0], jnp.float32), jnp.asarray(motions, jnp.float32)
+    )
+    return state._replace(params=params, frames=state.frames.put(chosen, T_inner=np.asarray(T_inner)))
 
 
 def _due(system: System, state: SlamState, frame: Frame) -> bool:
@@ -166,6 +180,7 @@ def _finish(system: System, state: SlamState) -> SlamResult:
     fitted = fit(field, t, T_world_cam, params=start, steps=400, learning_rate=1e-3)
     return SlamResult(
         T_world_cam,
+        frames.T_inner,
         lost=frames.lost,
         uncertain=frames.uncertain,
         mapped=frames.mapped,

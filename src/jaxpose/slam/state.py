@@ -14,6 +14,7 @@ class Frames(NamedTuple):
     """What is known of every frame of a recording, one row a frame; of those to come NaN, False or 0."""
 
     T_world_body: Float[np.ndarray, "n 4 4"]
+    T_inner: Float[np.ndarray, "n 4 4"]  # motion since the last frame, in the frame `intrinsic`
     lost: Bool[np.ndarray, " n"]  # tracking failed, the pose is the prediction
     uncertain: Bool[np.ndarray, " n"]  # lost, reckoned from the IMU, or little in the image to hold on to
     mapped: Bool[np.ndarray, " n"]  # the map was made from it
@@ -55,6 +56,7 @@ def no_frames(count: int) -> Frames:
     unknown, no = np.full(count, np.nan), np.zeros(count, bool)
     return Frames(
         T_world_body=np.full((count, 4, 4), np.nan),
+        T_inner=np.full((count, 4, 4), np.nan),
         lost=no,
         uncertain=no,
         mapped=no,

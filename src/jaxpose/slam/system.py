@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxpose import imu as inertial
+from jaxpose.camera import angle_of_view
 from jaxpose.errors import DataError
 from jaxpose.imu import ResidualSigmas
 from jaxpose.recording import Recording
@@ -16,6 +17,7 @@ from jaxpose.slam.config import IMU_WEIGHTS, SlamConfig
 from jaxpose.slam.frames import Framed, make_field
 from jaxpose.slam.keyframes import look
 from jaxpose.slam.predict import Readings, integrate, no_readings
+from jaxpose.slam.reframe import Refit, make_refit
 from jaxpose.slam.track import make_settle
 from jaxpose.slam.world import World, make_world
 
@@ -32,6 +34,7 @@ class System(NamedTuple):
     readings: Callable[[int, np.ndarray, np.ndarray, np.ndarray], Readings]
     world: Callable[[GridConfig], World]
     look: Callable[[int], np.ndarray]  # of a keyframe (`keyframes.look`)
+    refit: Refit | None  # of the frame `intrinsic`
 
 
 def make_system(recording: Recording, config: SlamConfig) -> System:
@@ -39,11 +42,12 @@ def make_system(recording: Recording, config: SlamConfig) -> System:
     readings = _readings(recording, config)
     t = recording.t
     framed = make_field(config.frame, config.field, float(np.median(np.diff(t))), float(t[-1] - t[0]))
-    settle = make_settle(framed, config.track, IMU_WEIGHTS[config.imu], _sigmas(recording, config))
+    view = angle_of_view(recording.camera)
+    settle = make_settle(framed, config.track, IMU_WEIGHTS[config.imu], _sigmas(recording, config), view)
+    refit = None if framed.parts is None else make_refit(*framed.parts, view)
     world = lru_cache(maxsize=1)(partial(make_world, recording, config, settle))
-    return System(
-        recording, config, framed, readings, world, lru_cache(None)(lambda i: look(recording.read(i)))
-    )
+    keyframe_look = lru_cache(None)(lambda i: look(recording.read(i)))
+    return System(recording, config, framed, readings, world, keyframe_look, refit)
 
 
 def _readings(

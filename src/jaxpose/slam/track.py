@@ -19,6 +19,7 @@ from jaxpose import se3
 from jaxpose.camera import Camera
 from jaxpose.fields import Params, pin
 from jaxpose.imu import ResidualSigmas
+from jaxpose.intrinsic import dof_loss
 from jaxpose.scenes import SceneField
 from jaxpose.slam.align import align, best_start, pose_sigma, starts
 from jaxpose.slam.frames import Framed, Gauge, Motion
@@ -45,23 +46,34 @@ class Tracked(NamedTuple):
 class Settle(NamedTuple):
     """What brings the field to a motion; compiled apart from the map, whose size may change.
 
-    `motion` is the field's since the last frame, `inertial` its loss against the readings, `bring` Adam's
-    way to a motion and to the readings, `pinned` that and Newton's to the poses at `interval.stamps[AHEAD -
-    1:]`, the first of them `T_ref_body`.
+    `motion` is the field's since the last frame, `beside` its loss beside the image's: against the readings,
+    and for few degrees of freedom in the intrinsic frame. `bring` is Adam's way to a motion and to those,
+    `pinned` that and Newton's to the poses at `interval.stamps[AHEAD - 1:]`, the first of them `T_ref_body`.
     """
 
     motion: Motion
-    inertial: Callable[[Params, Gauge, Interval], Float[Array, ""]]
+    beside: Callable[[Params, Gauge, Interval], Float[Array, ""]]
     bring: Callable[[Params, Gauge, Interval], Params]
     pinned: Callable[[Params, Gauge, Interval, Float[Array, "4 4"]], Params]
 
 
-def make_settle(framed: Framed, config: TrackConfig, weights: ImuWeights, sigmas: ResidualSigmas) -> Settle:
+def make_settle(
+    framed: Framed,
+    config: TrackConfig,
+    weights: ImuWeights,
+    sigmas: ResidualSigmas,
+    angle_of_view: float,
+) -> Settle:
     """The field's part of tracking, for a frame of reference and inertial weights."""
     motion = framed.motion
 
-    def inertial(params, gauge, interval):
-        return imu_loss(motion(params, gauge), interval, weights, sigmas)
+    def beside(params, gauge, interval):
+        total = imu_loss(motion(params, gauge), interval, weights, sigmas)
+        if framed.parts is not None:
+            _, inner = framed.parts
+            T_inner = inner.pose(params["inner"], interval.t + gauge.clock)
+            total = total + config.dof_weight * dof_loss(T_inner, angle_of_view)
+        return total
 
     def descend(params, gauge, interval, stamps, T_ref_body):
         def loss(params, i):
@@ -69,7 +81,7 @@ def make_settle(framed: Framed, config: TrackConfig, weights: ImuWeights, sigmas
             error = jax.vmap(motion(params, gauge))(stamps) - T_ref_body
             square = jnp.sum(error[:, :3] ** 2, axis=(-2, -1)) / _POSE_SIGMA**2
             # Square near zero, so that Adam settles; else by size.
-            return jnp.mean(jnp.sqrt(1 + square)) + inertial(params, gauge, interval), jnp.zeros(0)
+            return jnp.mean(jnp.sqrt(1 + square)) + beside(params, gauge, interval), jnp.zeros(0)
 
         return _descend(loss, params, config, config.field_steps, config.field_steps)[0][0]
 
@@ -87,7 +99,7 @@ def make_settle(framed: Framed, config: TrackConfig, weights: ImuWeights, sigmas
         arrived = jnp.abs(motion(params, gauge)(interval.t) - T_ref_body).max() < 10 * _POSE_SIGMA
         return jax.tree.map(lambda new, old: jnp.where(arrived, new, old), params, before)
 
-    return Settle(motion, inertial, bring, pinned)
+    return Settle(motion, beside, bring, pinned)
 
 
 def make_track(
@@ -140,7 +152,7 @@ def make_track(
             found = image_residuals(query, T_world_cam, pixels, far, config)
             total = image_loss(found, config)
             seen = jnp.stack([total, found.depth_error, found.valid])
-            return total + settle.inertial(params, gauge, interval), seen
+            return total + settle.beside(params, gauge, interval), seen
 
         (params, seen), i = _descend(loss, params, config, config.iterations, config.patience)
         image, error, valid = seen
