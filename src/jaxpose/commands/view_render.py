@@ -16,13 +16,14 @@ from jaxpose.commands.view_scene import Picture, Poses, Render
 from jaxpose.errors import DataError
 from jaxpose.experiments import event_nerf, noisy_nerf, slam_map
 from jaxpose.nerf import TrainConfig
+from jaxpose.slam.paint import painted
 
 
 def of_map(file: Path, camera: Camera, poses: Poses) -> Render:
     """The map of a SLAM run from where `poses` is at a time, light grey where it has no surface."""
     saved = slam_map.read_map(file)
-    look = slam_map.viewer(scenes.grid(saved.grid), saved.grid, camera)
-    params = (jnp.asarray(saved.values),)
+    look = slam_map.viewer(painted(scenes.grid(saved.grid), saved.grid), saved.grid, camera)
+    params = (jnp.asarray(saved.values), jnp.asarray(saved.paint))
 
     def render(t: float, width: int) -> Picture:
         return _picture(look(params, poses(np.array([t]))[0], slam_map.every(camera, width))[0])

@@ -25,7 +25,7 @@ _VIEW_WIDTH = 160  # [px] of rendered pictures, about
 _VIEWS = 4
 _MEASURED = 10  # frames of each kind
 _CHUNK = 4800  # rays rendered in one call
-_VERSION = 1  # of map.npz
+_VERSION = 2  # of map.npz
 
 PROTOCOL = (
     f"map rendered from estimated poses of at most {_MEASURED} frames of each kind, about {_VIEW_WIDTH} px "
@@ -59,6 +59,7 @@ class SavedMap(NamedTuple):
 
     grid: GridConfig
     values: Float[np.ndarray, "x y z 4"]  # of the finest level: signed distance [m], red, green, blue
+    paint: UInt8[np.ndarray, "u v w 4"]  # finer colour on the surface (`slam.paint`)
     keyframes: Int[np.ndarray, " k"]  # frames, counted from the first of the trajectory
 
 
@@ -118,7 +119,7 @@ def viewer(scene: SceneField, grid: GridConfig, camera: Camera) -> Viewer:
 
     A first pass over evenly spaced samples finds the surface, a second one looks closely.
     """
-    fine = SampleConfig(band=grid.truncation, width=grid.truncation / 8)
+    fine = SampleConfig(band=grid.truncation / 2, width=grid.truncation / 24)
     reach = float(np.linalg.norm(np.subtract(grid.upper, grid.lower)))
     evenly = int(np.clip(reach / grid.truncation * 4, 64, 256))
     coarse = SampleConfig(front=evenly, surface=0, behind=0, band=grid.truncation, width=grid.truncation / 4)
@@ -153,8 +154,8 @@ def every(camera: Camera, width: int) -> Int[np.ndarray, "h w 2"]:
 
 
 def write_map(path: Path | str, saved: SavedMap) -> None:
-    """Write a map (npz, compressed): version, the fields of its `GridConfig`, values and keyframes."""
-    arrays = asdict(saved.grid) | {"values": saved.values, "keyframes": saved.keyframes}
+    """Write a map (npz, compressed): version, the fields of its `GridConfig`, values, paint and keyframes."""
+    arrays = asdict(saved.grid) | {name: getattr(saved, name) for name in ("values", "paint", "keyframes")}
     with io.atomic(path) as temporary:
         np.savez_compressed(temporary, allow_pickle=False, version=_VERSION, **arrays)
 
@@ -169,7 +170,7 @@ def read_map(path: Path | str) -> SavedMap:
         lower, upper = (tuple(content[name].tolist()) for name in ("lower", "upper"))
         voxel, truncation = float(content["voxel"]), float(content["truncation"])
         config = GridConfig(lower, upper, voxel, int(content["levels"]), truncation)
-        return SavedMap(config, content["values"], content["keyframes"])
+        return SavedMap(config, content["values"], content["paint"], content["keyframes"])
     except (zipfile.BadZipFile, ValueError, KeyError, EOFError) as error:
         raise DataError(f"{path}: expected a map, got {' '.join(str(error).split())}") from None
 

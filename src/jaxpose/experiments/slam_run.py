@@ -153,8 +153,8 @@ def _single(
         io.write_tum(folder / "reference.txt", io.Trajectory(recording.t, truth))
     span = (0.0, float(recording.t[-1] - recording.t[0]))
     write_field(folder / "field.npz", span, [bspline_factor(span, result.field_params)])
-    values = np.asarray(result.scene_params[0])
-    write_map(folder / "map.npz", SavedMap(result.grid, values, result.keyframes))
+    values, coat = (np.asarray(x) for x in result.scene_params)
+    write_map(folder / "map.npz", SavedMap(result.grid, values, coat, result.keyframes))
     images_folder = "." if options.data is None else options.data.resolve()
     notes = (*recording.notes, *_write_surface(folder, recording, result))
     write_camera(folder / "camera.json", recording.camera, recording.files, images_folder)
@@ -184,7 +184,7 @@ def _write_surface(folder: Path, recording: Recording, result: SlamResult) -> tu
     points = cloud(keyframes(), recording.camera, result.grid.voxel)
     write_ply(folder / "points.ply", points.points, points.rgb)
     try:
-        (values,) = result.scene_params
+        values, _ = result.scene_params
         surface = mesh(result.grid, np.asarray(values), keyframes(), recording.camera)
     except ImportError:
         return ('no mesh.ply: pip install "jaxpose[mesh]" for marching cubes',)

@@ -68,7 +68,7 @@ def grid(config: GridConfig) -> SceneField:
 
 
 def box(
-    points: np.ndarray, *, voxel: float | None = None, levels: int = 2, nodes: int = 1_200_000
+    points: np.ndarray, *, voxel: float | None = None, levels: int = 2, nodes: int = 2_400_000
 ) -> GridConfig:
     """A grid around world points (n, 3) [m], a quarter of its size wider on every side.
 
@@ -175,7 +175,7 @@ def trilinear(values: Float[Array, "x y z c"], position: Float[Array, "3"]) -> F
 
     def along_z(a, b):
         start = (((i + a) * nodes[1] + j + b) * nodes[2] + k) * channels
-        row = jax.lax.dynamic_slice(flat, (start,), (2 * channels,))
+        row = jax.lax.dynamic_slice(flat, (start,), (2 * channels,)).astype(position.dtype)
         return _between(row[:channels], row[channels:], fraction[2])
 
     low = _between(along_z(0, 0), along_z(0, 1), fraction[1])

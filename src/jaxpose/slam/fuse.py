@@ -58,12 +58,14 @@ def make_fuse(config: GridConfig, camera: Camera, band: float):
     tile = np.minimum(_TILE, shape)
     starts = np.stack(np.mgrid[tuple(slice(0, n, k) for n, k in zip(shape, tile, strict=True))], axis=-1)
     starts = starts.reshape(-1, 3)
-    corners = lower + config.voxel * np.stack([starts + tile * np.array(c) for c in np.ndindex(2, 2, 2)], axis=1)
+    corners = lower + config.voxel * np.stack(
+        [starts + tile * np.array(c) for c in np.ndindex(2, 2, 2)], axis=1
+    )
     in_view = _cone(camera)
 
     @partial(jax.jit, donate_argnums=0)
     def update(state: MapState, image: Image, T_world_cam: Float[Array, "4 4"]) -> MapState:
-        measured = _measured(image, camera)
+        measured = measure(image, camera)
         T_cam_world = se3.inverse(T_world_cam)
         seen = in_view(se3.apply(T_cam_world, jnp.asarray(corners)), jnp.max(image.depth) + reach)
         order = jnp.asarray(starts)[jnp.argsort(~seen)]  # those in view come first
@@ -72,7 +74,9 @@ def make_fuse(config: GridConfig, camera: Camera, band: float):
             # The last tile along an axis is moved back into the grid: its first nodes are another's.
             first = jnp.minimum(order[n], jnp.asarray(shape - tile))
             index = [f + jnp.arange(k) for f, k in zip(first, tile, strict=True)]
-            nodes = [low + config.voxel * at.astype(jnp.float32) for low, at in zip(lower, index, strict=True)]
+            nodes = [
+                low + config.voxel * at.astype(jnp.float32) for low, at in zip(lower, index, strict=True)
+            ]
             nodes = jnp.stack(jnp.meshgrid(*nodes, indexing="ij"), axis=-1)
             own = [at >= start for at, start in zip(index, order[n], strict=True)]
             own = reduce(jnp.logical_and, jnp.meshgrid(*own, indexing="ij"))
@@ -111,7 +115,7 @@ def make_fuse(config: GridConfig, camera: Camera, band: float):
     return lambda params: MapState(params, jnp.zeros((*params[0].shape[:3], 5))), update
 
 
-def _measured(image: Image, camera: Camera) -> Float[Array, "h w 8"]:
+def measure(image: Image, camera: Camera) -> Float[Array, "h w 8"]:
     """What a pixel says: the plane there, how much it is worth (0: no depth), and its colour in [0, 1].
 
     Worth is the inverse variance of the depth, times the cosine of incidence.

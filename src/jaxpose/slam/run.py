@@ -14,8 +14,10 @@ from jaxpose.fields import PoseField, bspline, control_points, fit, stamped
 from jaxpose.recording import Frame, Recording
 from jaxpose.scenes import GridConfig, SceneField
 from jaxpose.slam.config import ImuMode, SlamConfig
+from jaxpose.slam.keyframes import read_keyframes
 from jaxpose.slam.localise import next_pose
 from jaxpose.slam.observe import Image
+from jaxpose.slam.paint import paint, painted
 from jaxpose.slam.predict import GYRO_BIAS_SIGMA
 from jaxpose.slam.reframe import Refit, due, window
 from jaxpose.slam.state import SlamState, no_frames
@@ -53,7 +55,7 @@ class SlamResult(NamedTuple):
     seconds: np.ndarray  # (n,) wall time, compilation included
     scene: SceneField
     grid: GridConfig
-    scene_params: Any
+    scene_params: Any  # (values of the grid's nodes, their paint)
     keyframes: Int[np.ndarray, " k"]  # which frames they are
     field: PoseField  # camera in the world over the whole recording
     field_params: Any
@@ -178,6 +180,10 @@ def _finish(system: System, state: SlamState) -> SlamResult:
     between = jax.vmap(stamped(jnp.asarray(t, jnp.float32), jnp.asarray(T_world_cam, jnp.float32)))
     start = control_points(between(jnp.asarray(knots, jnp.float32)))
     fitted = fit(field, t, T_world_cam, params=start, steps=400, learning_rate=1e-3)
+    scene, (values,) = system.world(state.grid).scene, scene_params(state.map)
+    keyframes = np.flatnonzero(frames.keyframe)
+    views = read_keyframes(recording, keyframes, T_world_cam)
+    coat = paint(state.grid, np.asarray(values[..., 0]), views, recording.camera)
     return SlamResult(
         T_world_cam,
         frames.T_inner,
@@ -190,10 +196,10 @@ def _finish(system: System, state: SlamState) -> SlamResult:
         valid=frames.valid,
         sigma=frames.sigma,
         seconds=frames.seconds,
-        scene=system.world(state.grid).scene,
+        scene=painted(scene, state.grid),
         grid=state.grid,
-        scene_params=scene_params(state.map),
-        keyframes=np.flatnonzero(frames.keyframe),
+        scene_params=(values, jnp.asarray(coat)),
+        keyframes=keyframes,
         field=field,
         field_params=fitted.params,
         field_rmse_m=float(fitted.translation_rmse_m),

@@ -14,8 +14,8 @@ from jaxpose.recording import Frame, Recording
 from jaxpose.scenes import GridConfig, SceneField, box, grid, grow, merge
 from jaxpose.scenes.base import Params
 from jaxpose.slam.config import SlamConfig
-from jaxpose.slam.keyframes import choose, overlap, read_keyframes
 from jaxpose.slam.fuse import look_up, make_fuse
+from jaxpose.slam.keyframes import choose, overlap, read_keyframes
 from jaxpose.slam.mapping import MapState, make_descend
 from jaxpose.slam.observe import Image, sample_pixels
 from jaxpose.slam.search import search as find
