@@ -43,6 +43,12 @@ def seen_by_all(shifts, margin=1):
     return inside
 
 
+def cosine(points):
+    """Of incidence on the wall of the nearest pixel's ray, for points in the axes of a camera."""
+    x, y = (np.round(60 * points[:, k] / points[:, 2] + c) - c for k, c in ((0, 31.5), (1, 23.5)))
+    return 1 / np.sqrt((x / 60) ** 2 + (y / 60) ** 2 + 1)
+
+
 def fuse(images, shifts):
     init, update = make_fuse(CONFIG, CAMERA, BAND)
     state = init(grid(CONFIG).init(jax.random.key(0)))
@@ -66,17 +72,20 @@ def test_a_wall_seen_from_several_places_is_exact():
 
 
 def test_two_observations_are_weighted_as_numpy_does():
-    """Inverse variances of the published sigma, at the depths that were measured."""
+    """Inverse variances of the published sigma at the depths that were measured, times the cosine of incidence."""
     shifts, errors, greys = SHIFTS[[0, 3]], (0.03, -0.02), (50, 200)
     images = [wall_image(s, error=e, grey=g) for s, e, g in zip(shifts, errors, greys, strict=True)]
     values = np.asarray(fuse(images, shifts).params[0])
     depths = [WALL_Z - s[2] + e for s, e in zip(shifts, errors, strict=True)]
     weights = [(0.0012 + 0.0019 * (d - 0.4) ** 2) ** -2 for d in depths]
-    distance = WALL_Z - node_positions(CONFIG)[..., 2].astype(np.float64)
+    nodes = node_positions(CONFIG).astype(np.float64)
+    distance = WALL_Z - nodes[..., 2]
     near = seen_by_all(shifts) & (np.abs(distance) < 0.1)
     assert near.sum() > 200
-    assert_allclose(values[near, 0], distance[near] + np.average(errors, weights=weights), atol=3e-6)
-    assert_allclose(values[near, 1], np.average(greys, weights=weights) / 255, atol=3e-6)
+    weights = np.stack([w * cosine(nodes[near] - s) for w, s in zip(weights, shifts, strict=True)], axis=-1)
+    mean = lambda x: np.average(np.broadcast_to(x, weights.shape), axis=-1, weights=weights)
+    assert_allclose(values[near, 0], distance[near] + mean(errors), atol=3e-6)
+    assert_allclose(values[near, 1], mean(greys) / 255, atol=3e-6)
 
 
 def test_the_wide_distance_reaches_farther_and_knows_where_it_was_measured():

@@ -11,7 +11,7 @@ that one (`look_up`), from farther off.
 """
 
 from collections.abc import Callable
-from functools import partial, reduce
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -25,14 +25,13 @@ from jaxpose.scenes import GridConfig, SceneField, node_shape
 from jaxpose.scenes.base import Params
 from jaxpose.scenes.grid import trilinear
 from jaxpose.slam.mapping import MapState
-from jaxpose.slam.observe import Image, depth_sigma, locate
-from jaxpose.slam.planes import tangent_planes
+from jaxpose.slam.observe import Image, locate
+from jaxpose.slam.planes import GRAZING, seen_by
 
 _MEMORY = 100.0  # frames, at a depth of one metre: older ones are slowly forgotten
 _REACH = 8  # voxels to either side of a surface of which the wide distance knows
 _TILE = 8  # nodes along each side of what is updated, or skipped, in one go
 _CUT = 0.98  # of a distance's reach: what is nearer to its end was cut off
-_GRAZING = 0.1  # a surface seen at a lower cosine counts as if it were seen at this one
 
 
 class Nearby(NamedTuple):
@@ -56,87 +55,66 @@ def make_fuse(config: GridConfig, camera: Camera, band: float):
     reach = _REACH * config.voxel
     lower, shape = np.asarray(config.lower, np.float32), node_shape(config)
     tile = np.minimum(_TILE, shape)
-    starts = np.stack(np.mgrid[tuple(slice(0, n, k) for n, k in zip(shape, tile, strict=True))], axis=-1)
-    starts = starts.reshape(-1, 3)
-    corners = lower + config.voxel * np.stack(
-        [starts + tile * np.array(c) for c in np.ndindex(2, 2, 2)], axis=1
-    )
+    starts = np.stack(np.mgrid[tuple(map(slice, np.zeros(3, int), shape, tile))], axis=-1).reshape(-1, 3)
+    corners = starts[:, None] + tile * np.array(list(np.ndindex(2, 2, 2)))
+    corners = jnp.asarray(lower + config.voxel * corners, jnp.float32)
     in_view = _cone(camera)
+
+    def fused(values, memory, points_cam, own, seen_at):
+        """Nodes with what an image says of them added; those that are not `own` stay as they are."""
+        at = locate(camera, points_cam)
+        seen = seen_at(at)
+        distance = seen.distance(points_cam)
+        # How far behind a surface a node is goes by the optical axis: at a grazing angle little is known.
+        along = distance * at.depth / jnp.maximum(seen.facing(points_cam), GRAZING * at.depth)
+        worth = jnp.where(own, seen.worth, 0)
+        gain = jnp.stack([
+            jnp.where(along > -band, worth, 0),
+            jnp.where(jnp.abs(along) < band, worth, 0),
+            jnp.where(along > -reach, worth, 0),
+        ], axis=-1)  # fmt: skip
+        weight, wide, known = memory[..., :3], memory[..., 3], memory[..., 4]
+        total = weight + gain
+        share = gain / jnp.where(total > 0, total, 1)
+        found = jnp.concatenate([jnp.minimum(distance, band)[..., None], seen.rgb], axis=-1)
+        values = values + share[..., jnp.array([0, 1, 1, 1])] * (found - values)
+        wide = wide + share[..., 2] * (jnp.minimum(distance, reach) - wide)
+        known = jnp.where(gain[..., 2] > 0, 1, known)
+        memory = [jnp.minimum(total, _MEMORY), wide[..., None], known[..., None]]
+        return values, jnp.concatenate(memory, axis=-1)
 
     @partial(jax.jit, donate_argnums=0)
     def update(state: MapState, image: Image, T_world_cam: Float[Array, "4 4"]) -> MapState:
-        measured = measure(image, camera)
-        T_cam_world = se3.inverse(T_world_cam)
-        seen = in_view(se3.apply(T_cam_world, jnp.asarray(corners)), jnp.max(image.depth) + reach)
-        order = jnp.asarray(starts)[jnp.argsort(~seen)]  # those in view come first
+        seen_at, T_cam_world = seen_by(image, camera), se3.inverse(T_world_cam)
+        in_sight = in_view(se3.apply(T_cam_world, corners), jnp.max(image.depth) + reach)
+        order = jnp.asarray(starts)[jnp.argsort(~in_sight)]  # those in sight come first
 
         def fuse_tile(n, maps):
             # The last tile along an axis is moved back into the grid: its first nodes are another's.
             first = jnp.minimum(order[n], jnp.asarray(shape - tile))
-            index = [f + jnp.arange(k) for f, k in zip(first, tile, strict=True)]
-            nodes = [
-                low + config.voxel * at.astype(jnp.float32) for low, at in zip(lower, index, strict=True)
-            ]
-            nodes = jnp.stack(jnp.meshgrid(*nodes, indexing="ij"), axis=-1)
-            own = [at >= start for at, start in zip(index, order[n], strict=True)]
-            own = reduce(jnp.logical_and, jnp.meshgrid(*own, indexing="ij"))
+            index = [start + jnp.arange(size) for start, size in zip(first, tile, strict=True)]
+            index = jnp.stack(jnp.meshgrid(*index, indexing="ij"), axis=-1)
+            own = jnp.all(index >= order[n].reshape(1, 1, 1, 3), axis=-1)
+            points = jnp.asarray(lower).reshape(1, 1, 1, 3) + config.voxel * index.astype(jnp.float32)
             parts = (jax.lax.dynamic_slice(m, (*first, 0), (*tile, m.shape[3])) for m in maps)
+            parts = fused(*parts, se3.apply(T_cam_world, points), own, seen_at)
             return tuple(
                 jax.lax.dynamic_update_slice(m, part, (*first, 0))
-                for m, part in zip(maps, fused(*parts, se3.apply(T_cam_world, nodes), own), strict=True)
+                for m, part in zip(maps, parts, strict=True)
             )
 
-        def fused(values, memory, nodes_cam, own):
-            at = locate(camera, nodes_cam)
-            pixel = measured[at.row, at.column]
-            forth = jnp.sum(pixel[..., :3] * nodes_cam, axis=-1)
-            distance = forth + pixel[..., 3]
-            # How far behind the surface a node is goes by the optical axis: at a grazing angle little is known.
-            along = distance * at.depth / jnp.maximum(-forth, _GRAZING * at.depth)
-            worth = jnp.where(at.inside & own, pixel[..., 4], 0)
-            gain = jnp.stack([
-                jnp.where(along > -band, worth, 0),
-                jnp.where(jnp.abs(along) < band, worth, 0),
-                jnp.where(along > -reach, worth, 0),
-            ], axis=-1)  # fmt: skip
-            weight, wide, known = memory[..., :3], memory[..., 3], memory[..., 4]
-            total = weight + gain
-            share = gain / jnp.where(total > 0, total, 1)
-            found = jnp.concatenate([jnp.minimum(distance, band)[..., None], pixel[..., 5:]], axis=-1)
-            values = values + share[..., jnp.array([0, 1, 1, 1])] * (found - values)
-            wide = wide + share[..., 2] * (jnp.minimum(distance, reach) - wide)
-            known = jnp.where(gain[..., 2] > 0, 1, known)
-            memory = [jnp.minimum(total, _MEMORY), wide[..., None], known[..., None]]
-            return values, jnp.concatenate(memory, axis=-1)
-
-        values, memory = jax.lax.fori_loop(0, jnp.sum(seen), fuse_tile, (state.params[0], state.memory))
-        return MapState((values,), memory)
+        # One tile after the other, in place: what is in between stays small, whatever the map's size.
+        maps = jax.lax.fori_loop(0, jnp.sum(in_sight), fuse_tile, (state.params[0], state.memory))
+        return MapState(maps[:1], maps[1])
 
     return lambda params: MapState(params, jnp.zeros((*params[0].shape[:3], 5))), update
-
-
-def measure(image: Image, camera: Camera) -> Float[Array, "h w 8"]:
-    """What a pixel says: the plane there, how much it is worth (0: no depth), and its colour in [0, 1].
-
-    Worth is the inverse variance of the depth, times the cosine of incidence.
-    """
-    column, row = jnp.meshgrid(jnp.arange(camera.width), jnp.arange(camera.height))
-    direction = pixel_direction(camera, jnp.stack([column, row], axis=-1).astype(jnp.float32))
-    planes = tangent_planes(image.depth, camera)
-    cosine = -jnp.sum(planes[..., :3] * direction, axis=-1) / jnp.linalg.norm(direction, axis=-1)
-    near = (depth_sigma(jnp.ones(())) / depth_sigma(image.depth)) ** 2
-    worth = jnp.where(image.depth > 0, near * jnp.maximum(cosine, _GRAZING), 0)
-    return jnp.concatenate([planes, worth[..., None], image.rgb.astype(jnp.float32) / 255], axis=-1)
 
 
 def _cone(camera: Camera) -> Callable[[Float[Array, "m 8 3"], Float[Array, ""]], Bool[Array, " m"]]:
     """A test of whether a box, by its corners in camera axes, may be in view and nearer than a depth."""
     column, row = np.meshgrid(np.arange(-1, camera.width + 1), np.arange(-1, camera.height + 1))
-    with jax.ensure_compile_time_eval():
-        pixel = jnp.asarray(np.stack([column, row], axis=-1), jnp.float32)
-        rays = np.asarray(pixel_direction(camera, pixel))
-    left, top = rays[..., :2].min(axis=(0, 1))
-    right, bottom = rays[..., :2].max(axis=(0, 1))
+    rays = np.asarray(pixel_direction(camera, jnp.asarray(np.stack([column, row], axis=-1), jnp.float32)))
+    (left, top), (right, bottom) = rays[..., :2].min(axis=(0, 1)), rays[..., :2].max(axis=(0, 1))
 
     def in_view(corners, farthest):
         x, y, z = jnp.moveaxis(corners, -1, 0)
@@ -149,15 +127,17 @@ def _cone(camera: Camera) -> Callable[[Float[Array, "m 8 3"], Float[Array, ""]],
 def look_up(
     scene: SceneField, config: GridConfig, wide: bool, params: Params, memory: Any, point: Float[Array, "3"]
 ) -> Nearby:
-    """A point in a map: by the scene's distance or, where that is cut off, by the wide one of a fused map.
+    """A point in a map: by the scene's distance and, away from surfaces, by the wide one of a fused map.
 
     Near a surface the scene's own is the truer one: the wide one mixes what is on both sides of thin things.
+    Farther off, nodes of the cell that it comes from are cut off.
     """
     distance, rgb = scene.query(params, point, jnp.zeros(3, point.dtype))
     if not wide:
         return Nearby(distance, rgb, (jnp.abs(distance) < _CUT * config.truncation).astype(distance.dtype))
-    position = (point - jnp.asarray(config.lower, point.dtype)) / config.voxel
-    *_, far, known = trilinear(memory, position)
+    *_, far, known = trilinear(memory, (point - jnp.asarray(config.lower, point.dtype)) / config.voxel)
     measured = (known > 1 - 1e-3) & (jnp.abs(far) < _CUT * _REACH * config.voxel)
-    distance = jnp.where(jnp.abs(distance) < _CUT * config.truncation, distance, far)
-    return Nearby(distance, rgb, measured.astype(distance.dtype))
+    whole = (jnp.abs(distance) < config.truncation - 3**0.5 * config.voxel) & (
+        jnp.abs(far) < config.truncation - config.voxel
+    )
+    return Nearby(jnp.where(whole, distance, far), rgb, measured.astype(distance.dtype))

@@ -15,9 +15,9 @@ from jaxpose import se3
 from jaxpose.camera import Camera
 from jaxpose.scenes import GridConfig, SceneField
 from jaxpose.scenes.grid import trilinear
-from jaxpose.slam.fuse import measure
 from jaxpose.slam.keyframes import Keyframe
 from jaxpose.slam.observe import locate
+from jaxpose.slam.planes import seen_by
 
 _FINER = 2  # cells of paint along one of the map's
 _COAT = 1.2  # cells of paint to either side of the surface
@@ -41,13 +41,11 @@ def paint(
     def add(total, points, image, T_world_cam):
         points_cam = se3.apply(se3.inverse(T_world_cam), points)
         at = locate(camera, points_cam)
-        pixel = measure(image, camera)[at.row, at.column]
-        forth = jnp.sum(pixel[:, :3] * points_cam, axis=-1)
-        seen = at.inside & (pixel[:, 4] > 0) & (jnp.abs(forth + pixel[:, 3]) < near)
-        weight = jnp.where(seen, jnp.maximum(-forth, 0) / jnp.maximum(at.depth, 0.1) ** 3, 0)
-        return total + weight[:, None] * jnp.concatenate(
-            [pixel[:, 5:], jnp.ones_like(weight)[:, None]], axis=-1
-        )
+        seen = seen_by(image, camera)(at)
+        same = (seen.worth > 0) & (jnp.abs(seen.distance(points_cam)) < near)
+        filled = jnp.maximum(seen.facing(points_cam), 0) / jnp.maximum(at.depth, 0.1) ** 3
+        weight = jnp.where(same, filled, 0)[:, None]
+        return total + weight * jnp.concatenate([seen.rgb, jnp.ones_like(weight)], axis=-1)
 
     total, on_device = jnp.zeros((len(nodes), 4)), jnp.asarray(points)
     for keyframe in keyframes:

@@ -1,15 +1,55 @@
-"""The surface at every pixel of a depth image, as the plane that touches it there."""
+"""What every pixel of an RGB-D image says of the surface there: the plane that touches it, and its colour."""
+
+from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxpose.camera import Camera, pixel_direction
-from jaxpose.slam.observe import depth_sigma
+from jaxpose.slam.observe import Image, Located, depth_sigma
 
 _RADIUS = 4  # [px] of the window that slopes are measured in
 _SAME_SURFACE = 3.0  # sigmas of depth that the middle between two pixels may be off the pixel there
-_GRAZING = 0.1  # cosine of incidence below which a plane says nothing
+GRAZING = 0.1  # cosine of incidence below which a plane says nothing
+
+
+class Seen(NamedTuple):
+    """What pixels say: the plane n . x + d = 0 [m] in camera axes, its worth (0: no depth), its colour.
+
+    Worth is the inverse variance of the depth against that at a metre, times the cosine of incidence.
+    """
+
+    normal: Float[Array, "*n 3"]
+    offset: Float[Array, "*n"]
+    worth: Float[Array, "*n"]
+    rgb: Float[Array, "*n 3"]  # in [0, 1]
+
+    def distance(self, point_cam: Float[Array, "*n 3"]) -> Float[Array, "*n"]:
+        """Signed distance [m] of points in camera axes to the planes, positive in front of them."""
+        return jnp.sum(self.normal * point_cam, axis=-1) + self.offset
+
+    def facing(self, point_cam: Float[Array, "*n 3"]) -> Float[Array, "*n"]:
+        """How far [m] the points are from the camera along the planes' normals."""
+        return -jnp.sum(self.normal * point_cam, axis=-1)
+
+
+def seen_by(image: Image, camera: Camera) -> Callable[[Located], Seen]:
+    """What an image says at located points, ready to be asked: one row is read for each."""
+    column, row = jnp.meshgrid(jnp.arange(camera.width), jnp.arange(camera.height))
+    direction = pixel_direction(camera, jnp.stack([column, row], axis=-1).astype(image.depth.dtype))
+    planes = tangent_planes(image.depth, camera)
+    cosine = -jnp.sum(planes[..., :3] * direction, axis=-1) / jnp.linalg.norm(direction, axis=-1)
+    near = (depth_sigma(jnp.ones(())) / depth_sigma(image.depth)) ** 2
+    worth = jnp.where(image.depth > 0, near * jnp.maximum(cosine, GRAZING), 0)
+    rows = jnp.concatenate([planes, worth[..., None], image.rgb.astype(planes.dtype) / 255], axis=-1)
+
+    def at(located: Located) -> Seen:
+        row = rows[located.row, located.column]
+        return Seen(row[..., :3], row[..., 3], jnp.where(located.inside, row[..., 4], 0), row[..., 5:])
+
+    return at
 
 
 def tangent_planes(depth: Float[Array, "h w"], camera: Camera) -> Float[Array, "h w 4"]:
@@ -32,7 +72,7 @@ def tangent_planes(depth: Float[Array, "h w"], camera: Camera) -> Float[Array, "
     normal = along / jnp.maximum(jnp.linalg.norm(along, axis=-1, keepdims=True), 1e-9)
     point = depth[..., None] * direction
     cosine = -jnp.sum(normal * direction, axis=-1) / jnp.linalg.norm(direction, axis=-1)
-    plane = (known_x & known_y & seen & (cosine > _GRAZING))[..., None]
+    plane = (known_x & known_y & seen & (cosine > GRAZING))[..., None]
     normal = jnp.where(plane, normal, jnp.array([0.0, 0.0, -1.0], depth.dtype))
     return jnp.concatenate([normal, -jnp.sum(normal * point, axis=-1, keepdims=True)], axis=-1)
 
