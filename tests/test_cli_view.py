@@ -65,7 +65,8 @@ def run(tmp_path):
     values[..., 0] = np.clip(WALL - (grid.lower[2] + 0.1 * z), -0.3, 0.3)
     left = grid.lower[0] + 0.1 * x < 0.1
     values[..., 1], values[..., 3] = left, ~left
-    write_map(folder / "map.npz", SavedMap(grid, values, np.array([0, 4])))
+    unpainted = np.zeros((89, 81, 49, 4), np.uint8)
+    write_map(folder / "map.npz", SavedMap(grid, values, unpainted, np.array([0, 4])))
     corners = np.array([[-1, -1, WALL], [1, -1, WALL], [1, 1, WALL]])
     write_ply(folder / "mesh.ply", corners, np.full((3, 3), 200, np.uint8), np.array([[0, 2, 1]]))
     io.write_json(folder / "results.json", {"experiment": "rgbd_slam"})
@@ -254,8 +255,8 @@ def test_wrong_calls_cost_one_line(run, tmp_path):
 def test_a_map_of_another_kind(run):
     with np.load(run / "map.npz") as file:
         content = dict(file)
-    np.savez(run / "map.npz", **(content | {"version": 2}))
-    with pytest.raises(DataError, match="map.npz: expected a map of version 1, got 2"):
+    np.savez(run / "map.npz", **(content | {"version": 1}))
+    with pytest.raises(DataError, match="map.npz: expected a map of version 2, got 1"):
         read_scene(run, 0)
     np.savez(run / "map.npz", **(content | {"keyframes": np.array([0, 9])}))
     with pytest.raises(DataError, match="map.npz: expected keyframes below 9, got 9"):

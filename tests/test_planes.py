@@ -67,7 +67,7 @@ def test_noise_turns_a_plane_by_a_few_degrees():
     )
     found = planes(noisy.astype(np.float32))
     known = np.abs(found[..., 2] + 1) > 1e-6
-    assert known.mean() > 0.95
+    assert known[1:-1, 1:-1].mean() > 0.95
     off = np.rad2deg(np.arccos(np.clip(found[known][:, :3] @ unit, -1, 1)))
     assert np.median(off) < 3
 
@@ -92,7 +92,7 @@ def test_what_pixels_say_of_points():
     depth, unit = wall((0.3, -0.2, -1), 1.4)
     depth[:, 50:] = 0
     image = Image(jnp.full((48, 64, 3), 51, jnp.uint8), jnp.asarray(depth))
-    points = np.random.default_rng(0).uniform([-0.6, -0.4, 1.0], [0.3, 0.4, 1.8], (50, 3)).astype(np.float32)
+    points = np.random.default_rng(0).uniform([-0.4, -0.3, 1.0], [0.25, 0.3, 1.8], (50, 3)).astype(np.float32)
     at = locate(CAMERA, jnp.asarray(points))
     seen = jax.jit(lambda: seen_by(image, CAMERA)(at))()
     assert_allclose(seen.distance(jnp.asarray(points)), points @ unit + 1.4, atol=1e-3)

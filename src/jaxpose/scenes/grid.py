@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, Real
 
 from jaxpose.scenes.base import Params, SceneField
 
@@ -160,7 +160,7 @@ def _refine(values: Float[Array, "x y z c"], axis: int) -> Float[Array, "_ _ _ c
     )
 
 
-def trilinear(values: Float[Array, "x y z c"], position: Float[Array, "3"]) -> Float[Array, " c"]:
+def trilinear(values: Real[Array, "x y z c"], position: Float[Array, "3"]) -> Float[Array, " c"]:
     """Value at a position in cells, outside that of the nearest face.
 
     Four rows of two nodes: on a CPU the fastest of the ways tried.
