@@ -122,12 +122,16 @@ def test_report_states_numbers_with_their_protocol(finished):
 
 def test_rgbd_slam_on_a_folder(folder, tmp_path, capsys):
     out = tmp_path / "run"
-    rgbd_slam.main(["--data", str(folder), "--recorded-hz", "5", "--smoke", "--out", str(out)])
+    rgbd_slam.main(
+        ["--data", str(folder), "--recorded-hz", "5", "--smoke", "--frame", "intrinsic", "--out", str(out)]
+    )
     said = capsys.readouterr()
     assert "office/seq-01" in said.out and "IMU none" in said.out
     assert "8/8" in said.err  # the bar
-    assert {path.name for path in out.iterdir()} == FILES  # and no picture of an IMU
+    assert {path.name for path in out.iterdir()} == FILES | {"freedom.png"}  # and no picture of an IMU
     results = json.loads((out / "results.json").read_text())
+    dof = results["degrees_of_freedom"]
+    assert dof["after_mean"] < dof["before_mean"] <= 6 and "in the intrinsic frame" in said.out
     assert results["ate_rmse_m"] < 0.02
     assert results["imu"] == {"mode": "none", "readings": "not used"}
     camera, images, where = read_camera(out / "camera.json")
@@ -145,8 +149,8 @@ def test_compare_runs_every_mode(finished, tmp_path, monkeypatch, recording):
         field, params = slam_run.load_field(finished.folder)
         poses = io.read_tum(finished.folder / "trajectory.txt").T
         return slam_run.SlamResult(
-            poses, *np.zeros((2, FRAMES), bool), np.ones(FRAMES, bool), np.ones(FRAMES, int),
-            *np.ones((3, FRAMES)), np.ones((FRAMES, 2)), np.ones(FRAMES), None, None, (np.zeros(1),),
+            poses, np.full_like(poses, np.nan), *np.zeros((2, FRAMES), bool), np.ones(FRAMES, bool),
+            np.ones(FRAMES, int), *np.ones((3, FRAMES)), np.ones((FRAMES, 2)), np.ones(FRAMES), None, None, (np.zeros(1),) * 2,
             np.zeros(0, int), field, params, 0.0, 0.0,
         )  # fmt: skip
 

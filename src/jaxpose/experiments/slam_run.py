@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -83,6 +84,7 @@ def _compare(
         by_mode[mode], errors[mode] = _single(
             experiment, single, source, folder / mode, on_frame, time.perf_counter()
         )
+        jax.clear_caches()  # a mode's compiled steps are of no use to the next, and fill memory
     results = {
         "experiment": experiment,
         "seed": options.slam.seed,
