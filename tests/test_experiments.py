@@ -150,7 +150,8 @@ def test_compare_runs_every_mode(finished, tmp_path, monkeypatch, recording):
         poses = io.read_tum(finished.folder / "trajectory.txt").T
         return slam_run.SlamResult(
             poses, np.full_like(poses, np.nan), *np.zeros((2, FRAMES), bool), np.ones(FRAMES, bool),
-            np.ones(FRAMES, int), *np.ones((3, FRAMES)), np.ones((FRAMES, 2)), np.ones(FRAMES), None, None, (np.zeros(1),) * 2,
+            np.ones(FRAMES, int), *np.ones((3, FRAMES)), np.ones((FRAMES, 2)), np.ones(FRAMES),
+            None, None, (np.zeros(1),) * 2,
             np.zeros(0, int), field, params, 0.0, 0.0,
         )  # fmt: skip
 
