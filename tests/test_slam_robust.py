@@ -1,4 +1,6 @@
-"""Losses: the wide search in a closed-form room, lost frames bent, blackouts with and without an IMU."""
+"""Losses: the wide search in a closed-form room, lost frames, blackouts; and what a run keeps in memory."""
+
+import weakref
 
 import jax
 import jax.numpy as jnp
@@ -164,3 +166,20 @@ def test_dropped_frames_are_survived(walk):
     some = select(walk, np.union1d([0], kept))
     result = run(some, SlamConfig(imu="combined"))
     assert not result.lost.any() and metrics.ate(result.T_world_cam, some.T_world_cam).rmse < 0.02
+
+
+@pytest.mark.slow
+def test_no_image_is_kept_in_memory():
+    """However long a recording is: keyframes are read again when they are needed."""
+    source = room(RoomConfig(duration_s=5.0, width=80, height=60))
+    alive, most = [], []
+
+    def read(i):
+        frame = source.read(i)
+        frame = Frame(frame.rgb.copy(), frame.depth.copy())
+        alive.extend(weakref.ref(array) for array in frame)
+        return frame
+
+    run(source._replace(read=read), on_frame=lambda _: most.append(sum(r() is not None for r in alive)))
+    assert len(most) == len(source.t)
+    assert max(most) <= 4  # the arrays of two frames: the last one, and one that is on its way out
