@@ -55,7 +55,7 @@ def make_fuse(config: GridConfig, camera: Camera, band: float):
     reach = _REACH * config.voxel
     lower, shape = np.asarray(config.lower, np.float32), node_shape(config)
     tile = np.minimum(_TILE, shape)
-    starts = np.stack(np.mgrid[tuple(map(slice, np.zeros(3, int), shape, tile))], axis=-1).reshape(-1, 3)
+    starts = np.moveaxis(np.mgrid[tuple(map(slice, np.zeros(3, int), shape, tile))], 0, -1).reshape(-1, 3)
     corners = starts[:, None] + tile * np.array(list(np.ndindex(2, 2, 2)))
     corners = jnp.asarray(lower + config.voxel * corners, jnp.float32)
     in_view = _cone(camera)
@@ -96,8 +96,8 @@ def make_fuse(config: GridConfig, camera: Camera, band: float):
             index = jnp.stack(jnp.meshgrid(*index, indexing="ij"), axis=-1)
             own = jnp.all(index >= order[n].reshape(1, 1, 1, 3), axis=-1)
             points = jnp.asarray(lower).reshape(1, 1, 1, 3) + config.voxel * index.astype(jnp.float32)
-            parts = (jax.lax.dynamic_slice(m, (*first, 0), (*tile, m.shape[3])) for m in maps)
-            parts = fused(*parts, se3.apply(T_cam_world, points), own, seen_at)
+            values, memory = (jax.lax.dynamic_slice(m, (*first, 0), (*tile, m.shape[3])) for m in maps)
+            parts = fused(values, memory, se3.apply(T_cam_world, points), own, seen_at)
             return tuple(
                 jax.lax.dynamic_update_slice(m, part, (*first, 0))
                 for m, part in zip(maps, parts, strict=True)
