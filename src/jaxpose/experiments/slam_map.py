@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
-from jaxpose import io, metrics
+from jaxpose import io, metrics, se3
 from jaxpose.camera import Camera, pixel_direction
 from jaxpose.errors import DataError
 from jaxpose.plots import View
@@ -117,21 +117,31 @@ def renderer(recording: Recording, result: SlamResult) -> Renderer:
 def viewer(scene: SceneField, grid: GridConfig, camera: Camera) -> Viewer:
     """The map of a grid as seen from any pose of the camera; compiled once, whatever the pixels.
 
-    A first pass over evenly spaced samples finds the surface, a second one looks closely.
+    A first pass over evenly spaced samples finds where the ray goes behind a surface, a second one looks
+    closely.
     """
     fine = SampleConfig(band=grid.truncation / 2, width=grid.truncation / 24)
     reach = float(np.linalg.norm(np.subtract(grid.upper, grid.lower)))
     evenly = int(np.clip(reach / grid.truncation * 4, 64, 256))
-    coarse = SampleConfig(front=evenly, surface=0, behind=0, band=grid.truncation, width=grid.truncation / 4)
+    depths = jnp.linspace(0.02, reach, evenly)
 
     @jax.jit
     def render(params, T_world_cam: Float[Array, "4 4"], pixel: Float[Array, "n 2"]):
         query, far = partial(scene.query, params), jnp.float32(reach)
         direction = pixel_direction(camera, pixel)
-        unknown = Pixels(direction, jnp.zeros_like(direction[:, 0]), jnp.zeros_like(direction))
-        found = render_pixels(query, T_world_cam, unknown, far, coarse)
-        surface = jnp.where(found.opacity > 0.5, found.depth, 0)
-        seen = render_pixels(query, T_world_cam, unknown._replace(depth=surface), far, fine)
+
+        def behind(direction):
+            points = se3.apply(T_world_cam, depths[:, None] * direction[None])
+            distance, _ = jax.vmap(query, in_axes=(0, None))(points, direction)
+            enters = (distance[:-1] > 0) & (distance[1:] <= 0)
+            i = jnp.argmax(enters)
+            share = distance[i] / jnp.where(enters[i], distance[i] - distance[i + 1], 1)
+            return jnp.where(enters[i], depths[i] + share * (depths[i + 1] - depths[i]), 0)
+
+        surface = jax.vmap(behind)(direction)
+        seen = render_pixels(
+            query, T_world_cam, Pixels(direction, surface, jnp.zeros_like(direction)), far, fine
+        )
         there = (surface > 0) & (seen.opacity > 0.5)
         return jnp.where(there[:, None], seen.rgb, 0.86), jnp.where(there, seen.depth, 0)
 

@@ -30,6 +30,7 @@ from jaxpose.slam.planes import GRAZING, seen_by
 
 _MEMORY = 100.0  # frames, at a depth of one metre: older ones are slowly forgotten
 _REACH = 8  # voxels to either side of a surface of which the wide distance knows
+_BESIDE = 3**0.5  # voxels: nodes of the cells that hold a surface
 _TILE = 8  # nodes along each side of what is updated, or skipped, in one go
 _CUT = 0.98  # of a distance's reach: what is nearer to its end was cut off
 
@@ -52,7 +53,7 @@ def make_fuse(config: GridConfig, camera: Camera, band: float):
     (x, y, z, 5) holds the weights of distance, colour and wide distance, then the wide distance [m] and 1
     where it is known.
     """
-    reach = _REACH * config.voxel
+    reach, beside = _REACH * config.voxel, _BESIDE * config.voxel
     lower, shape = np.asarray(config.lower, np.float32), node_shape(config)
     tile = np.minimum(_TILE, shape)
     starts = np.moveaxis(np.mgrid[tuple(map(slice, np.zeros(3, int), shape, tile))], 0, -1).reshape(-1, 3)
@@ -65,8 +66,10 @@ def make_fuse(config: GridConfig, camera: Camera, band: float):
         at = locate(camera, points_cam)
         seen = seen_at(at)
         distance = seen.distance(points_cam)
-        # How far behind a surface a node is goes by the optical axis: at a grazing angle little is known.
+        # How far behind a surface a node is goes by the optical axis, as little is known there at a grazing
+        # angle; but the nodes next to it are needed on both sides.
         along = distance * at.depth / jnp.maximum(seen.facing(points_cam), GRAZING * at.depth)
+        along = jnp.where(jnp.abs(distance) < beside, distance, along)
         worth = jnp.where(own, seen.worth, 0)
         gain = jnp.stack([
             jnp.where(along > -band, worth, 0),
@@ -137,7 +140,7 @@ def look_up(
         return Nearby(distance, rgb, (jnp.abs(distance) < _CUT * config.truncation).astype(distance.dtype))
     *_, far, known = trilinear(memory, (point - jnp.asarray(config.lower, point.dtype)) / config.voxel)
     measured = (known > 1 - 1e-3) & (jnp.abs(far) < _CUT * _REACH * config.voxel)
-    whole = (jnp.abs(distance) < config.truncation - 3**0.5 * config.voxel) & (
+    whole = (jnp.abs(distance) < config.truncation - _BESIDE * config.voxel) & (
         jnp.abs(far) < config.truncation - config.voxel
     )
     return Nearby(jnp.where(whole, distance, far), rgb, measured.astype(distance.dtype))
