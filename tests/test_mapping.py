@@ -71,6 +71,50 @@ def test_a_wall_seen_from_several_places_is_exact():
     assert_array_equal(np.asarray(state.memory)[distance < -BAND - 1e-4, :2], 0)
 
 
+def slanted_image(normal, offset):
+    """The wall normal . x + offset = 0 from a camera at the origin."""
+    column, row = np.meshgrid(np.arange(64), np.arange(48))
+    rays = np.stack([(column - 31.5) / 60, (row - 23.5) / 60, np.ones_like(row)], axis=-1)
+    depth = (-offset / (rays @ normal)).astype(np.float32)
+    return Image(jnp.full((48, 64, 3), 100, jnp.uint8), jnp.asarray(depth))
+
+
+def test_a_slanted_wall_has_its_true_distance():
+    """Not that along the optical axis: views from different sides agree."""
+    normal = np.array([0.6, 0.0, -0.8])
+    state = fuse([slanted_image(normal, 1.44)], SHIFTS[:1])
+    distance = node_positions(CONFIG).astype(np.float64) @ normal + 1.44
+    known = seen_by_all(SHIFTS[:1], margin=3) & (distance > -BAND / 2)
+    assert known.sum() > 1000
+    values = np.asarray(state.params[0])
+    assert_allclose(values[known, 0], np.minimum(distance, BAND)[known], atol=1e-3)
+    assert np.abs(distance[known]).min() < 0.01
+
+
+def test_a_surface_at_a_grazing_angle_has_two_sides():
+    """A floor 0.3 below the camera: the nodes of the cells that hold it are measured above and below."""
+    normal, height = np.array([0.0, -1.0, 0.0]), 0.3
+    state = fuse([slanted_image(normal, height)._replace()], SHIFTS[:1])
+    values, distance = (
+        np.asarray(state.params[0]),
+        node_positions(CONFIG).astype(np.float64) @ normal + height,
+    )
+    below = seen_by_all(SHIFTS[:1], margin=3) & (distance < 0) & (distance > -CONFIG.voxel)
+    assert below.sum() > 50
+    assert_allclose(values[below, 0], distance[below], atol=2e-3)
+
+
+def test_tiles_leave_nothing_out(monkeypatch):
+    """The grid's sides are no multiples of a tile's."""
+    whole = []
+    for tile in (8, 7, 1000):
+        monkeypatch.setattr("jaxpose.slam.fuse._TILE", tile)
+        whole.append(fuse([wall_image(s) for s in SHIFTS], SHIFTS))
+    assert np.asarray(whole[0].memory).any()
+    for other in whole[1:]:
+        jax.tree.map(partial(assert_allclose, atol=1e-6), other, whole[0])
+
+
 def test_two_observations_are_weighted_as_numpy_does():
     """Inverse variances of the published sigma at the measured depths, times the cosine of incidence."""
     shifts, errors, greys = SHIFTS[[0, 3]], (0.03, -0.02), (50, 200)

@@ -142,7 +142,10 @@ def _map(quality: dict[str, Any]) -> list[str]:
         numbers = quality[kind]
         if numbers is not None:
             depth = _cm(numbers["depth_l1_m"])
-            words.append(f"{numbers['psnr']:.2f} dB, depth L1 {depth} cm at {numbers['frames']} {name}")
+            words.append(
+                f"{numbers['psnr']:.2f} dB, depth L1 {depth} cm over {numbers['share_of_depth_shown']:.1%} of "
+                f"the depth at {numbers['frames']} {name}"
+            )
     if not words:
         return []
     return [_line("map", "; ".join(words)), _line("", quality["protocol"])]
