@@ -141,10 +141,10 @@ def _map(quality: dict[str, Any]) -> list[str]:
     for kind, name in (("mapped", "mapped frames"), ("held_out", "held-out frames")):
         numbers = quality[kind]
         if numbers is not None:
-            depth = _cm(numbers["depth_l1_m"])
+            depth, share = _cm(numbers["depth_l1_m"]), f"{numbers['share_of_depth_shown']:.1%}"
             words.append(
-                f"{numbers['psnr']:.2f} dB, depth L1 {depth} cm over {numbers['share_of_depth_shown']:.1%} of "
-                f"the depth at {numbers['frames']} {name}"
+                f"{numbers['psnr']:.2f} dB, depth L1 {depth} cm over {share} of the depth at "
+                f"{numbers['frames']} {name}"
             )
     if not words:
         return []
