@@ -28,6 +28,7 @@ from jaxpose.experiments.slam_map import SavedMap, write_map
 from jaxpose.io_camera import write_camera
 from jaxpose.io_ply import write_ply
 from jaxpose.scenes import GridConfig
+from jaxpose.slam.paint import Paint
 
 COUNT, LAST, FIRST, SPEED = 9, 2.0, 5.0, 0.3  # frames, span [s], first stamp [s], along x [m/s]
 CAMERA = Camera(100.0, 100.0, 79.5, 59.5, 160, 120)
@@ -65,7 +66,7 @@ def run(tmp_path):
     values[..., 0] = np.clip(WALL - (grid.lower[2] + 0.1 * z), -0.3, 0.3)
     left = grid.lower[0] + 0.1 * x < 0.1
     values[..., 1], values[..., 3] = left, ~left
-    unpainted = np.zeros((89, 81, 49, 4), np.uint8)
+    unpainted = Paint(np.zeros((6, 5, 3), np.int32), np.zeros((1, 17, 17, 17, 4), np.uint8))
     write_map(folder / "map.npz", SavedMap(grid, values, unpainted, np.array([0, 4])))
     corners = np.array([[-1, -1, WALL], [1, -1, WALL], [1, 1, WALL]])
     write_ply(folder / "mesh.ply", corners, np.full((3, 3), 200, np.uint8), np.array([[0, 2, 1]]))

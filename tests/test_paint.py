@@ -3,13 +3,14 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose
+from scipy.ndimage import map_coordinates
 
 from jaxpose.camera import Camera, pixel_direction
 from jaxpose.scenes import GridConfig, grid, node_positions
 from jaxpose.slam.keyframes import Keyframe
 from jaxpose.slam.observe import Image
-from jaxpose.slam.paint import paint, painted
+from jaxpose.slam.paint import _tiled, paint, painted
 
 CAMERA = Camera(200.0, 200.0, 79.5, 59.5, 160, 120)
 GRID = GridConfig((-0.32, -0.24, 0.8), (0.32, 0.24, 1.2), voxel=0.04, levels=1, truncation=0.12)
@@ -42,7 +43,7 @@ def wall():
 
 
 def seen_at(points, coat):
-    scene, params = painted(grid(GRID), GRID), (jnp.asarray(wall()), jnp.asarray(coat))
+    scene, params = painted(grid(GRID), GRID), (jnp.asarray(wall()), jax.tree.map(jnp.asarray, coat))
     return jax.vmap(lambda p: scene.query(params, p, jnp.zeros(3)))(jnp.asarray(points, jnp.float32))
 
 
@@ -60,10 +61,11 @@ def test_a_wall_is_painted_finer_than_the_cells():
 
 def test_what_no_keyframe_saw_keeps_the_colour_of_the_map():
     away = np.diag([1.0, -1, -1, 1])
-    assert_array_equal(paint(GRID, wall()[..., 0], [], CAMERA), 0)
-    assert_array_equal(paint(GRID, wall()[..., 0], [keyframe(0, 0.0)._replace(T_world_cam=away)], CAMERA), 0)
+    for keyframes in ([], [keyframe(0, 0.0)._replace(T_world_cam=away)]):
+        coat = paint(GRID, wall()[..., 0], keyframes, CAMERA)
+        assert coat.tiles.shape[0] == 1 and not coat.tiles.any() and not coat.slot.any()
     coat = paint(GRID, wall()[..., 0], [keyframe(0, 0.0)], CAMERA)
-    assert coat.shape == (33, 25, 21, 4) and set(np.unique(coat[..., 3])) == {0, 255}
+    assert coat.slot.shape == (2, 2, 2) and set(np.unique(coat.tiles[..., 3])) == {0, 255}
     _, rgb = seen_at([[0.0, 0.0, WALL_Z - 0.1], [0.0, 0.0, WALL_Z + 0.1]], coat)
     assert_allclose(rgb, 0.5, atol=1e-6)
 
@@ -72,4 +74,19 @@ def test_a_keyframe_that_sees_something_else_there_paints_nothing():
     """A table in front of the wall, which the map does not hold: its colour does not land on the wall."""
     nearer = keyframe(0, 0.0)
     nearer = nearer._replace(image=nearer.image._replace(depth=nearer.image.depth - 0.2))
-    assert_array_equal(paint(GRID, wall()[..., 0], [nearer], CAMERA), 0)
+    assert not paint(GRID, wall()[..., 0], [nearer], CAMERA).tiles.any()
+
+
+def test_tiles_hold_what_a_dense_array_would():
+    """Against numpy, also across the sides of tiles."""
+    rng = np.random.default_rng(0)
+    dense = np.zeros((33, 25, 21, 4), np.uint8)
+    chosen = rng.random((33, 25, 21)) < 0.9
+    dense[chosen] = np.column_stack([rng.integers(0, 256, (chosen.sum(), 3)), np.full(chosen.sum(), 255)])
+    coat = _tiled(np.argwhere(chosen), dense[chosen], np.array([32, 24, 20]))
+    cells = rng.uniform(0, [32, 24, 20], (200, 3))
+    cells[:50] = np.round(cells[:50])
+    _, rgb = seen_at(np.array(GRID.lower) + cells * GRID.voxel / 2, coat)
+    read = [map_coordinates(dense[..., k].astype(float), cells.T, order=1) for k in range(4)]
+    known = read[3] > 0.3 * 255
+    assert_allclose(np.asarray(rgb)[known], np.stack(read[:3], -1)[known] / read[3][known, None], atol=2e-3)

@@ -23,7 +23,7 @@ def of_map(file: Path, camera: Camera, poses: Poses) -> Render:
     """The map of a SLAM run from where `poses` is at a time, light grey where it has no surface."""
     saved = slam_map.read_map(file)
     look = slam_map.viewer(painted(scenes.grid(saved.grid), saved.grid), saved.grid, camera)
-    params = (jnp.asarray(saved.values), jnp.asarray(saved.paint))
+    params = (jnp.asarray(saved.values), jax.tree.map(jnp.asarray, saved.paint))
 
     def render(t: float, width: int) -> Picture:
         return _picture(look(params, poses(np.array([t]))[0], slam_map.every(camera, width))[0])

@@ -19,6 +19,7 @@ from jaxpose.plots import View
 from jaxpose.recording import Recording
 from jaxpose.scenes import GridConfig, SceneField
 from jaxpose.slam.observe import Pixels, SampleConfig, render_pixels
+from jaxpose.slam.paint import Paint
 from jaxpose.slam.run import SlamResult
 
 _VIEW_WIDTH = 160  # [px] of rendered pictures, about
@@ -59,7 +60,7 @@ class SavedMap(NamedTuple):
 
     grid: GridConfig
     values: Float[np.ndarray, "x y z 4"]  # of the finest level: signed distance [m], red, green, blue
-    paint: UInt8[np.ndarray, "u v w 4"]  # finer colour on the surface (`slam.paint`)
+    paint: Paint  # finer colour on the surface
     keyframes: Int[np.ndarray, " k"]  # frames, counted from the first of the trajectory
 
 
@@ -164,8 +165,9 @@ def every(camera: Camera, width: int) -> Int[np.ndarray, "h w 2"]:
 
 
 def write_map(path: Path | str, saved: SavedMap) -> None:
-    """Write a map (npz, compressed): version, the fields of its `GridConfig`, values, paint and keyframes."""
-    arrays = asdict(saved.grid) | {name: getattr(saved, name) for name in ("values", "paint", "keyframes")}
+    """Write a map (npz, compressed): version, the fields of its `GridConfig`, values, paint, keyframes."""
+    arrays = asdict(saved.grid) | {"values": saved.values, "keyframes": saved.keyframes}
+    arrays |= {f"paint_{name}": array for name, array in saved.paint._asdict().items()}
     with io.atomic(path) as temporary:
         np.savez_compressed(temporary, allow_pickle=False, version=_VERSION, **arrays)
 
@@ -180,7 +182,8 @@ def read_map(path: Path | str) -> SavedMap:
         lower, upper = (tuple(content[name].tolist()) for name in ("lower", "upper"))
         voxel, truncation = float(content["voxel"]), float(content["truncation"])
         config = GridConfig(lower, upper, voxel, int(content["levels"]), truncation)
-        return SavedMap(config, content["values"], content["paint"], content["keyframes"])
+        coat = Paint(content["paint_slot"], content["paint_tiles"])
+        return SavedMap(config, content["values"], coat, content["keyframes"])
     except (zipfile.BadZipFile, ValueError, KeyError, EOFError) as error:
         raise DataError(f"{path}: expected a map, got {' '.join(str(error).split())}") from None
 

@@ -155,7 +155,7 @@ def _single(
         io.write_tum(folder / "reference.txt", io.Trajectory(recording.t, truth))
     span = (0.0, float(recording.t[-1] - recording.t[0]))
     write_field(folder / "field.npz", span, [bspline_factor(span, result.field_params)])
-    values, coat = (np.asarray(x) for x in result.scene_params)
+    values, coat = jax.tree.map(np.asarray, result.scene_params)
     write_map(folder / "map.npz", SavedMap(result.grid, values, coat, result.keyframes))
     images_folder = "." if options.data is None else options.data.resolve()
     notes = (*recording.notes, *_write_surface(folder, recording, result))

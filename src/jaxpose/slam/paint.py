@@ -5,6 +5,7 @@ map that is tracked against keeps coarse colour, and only what is rendered, or s
 """
 
 from collections.abc import Iterable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,12 +24,23 @@ _FINER = 2  # cells of paint along one of the map's
 _COAT = 1.2  # cells of paint to either side of the surface
 _SAME = 2.0  # cells of the map that a measured surface may be off the map's
 _PAINTED = 0.25  # weight of painted nodes around a point from which on they give its colour
+_TILE = 16  # cells of paint along each side of what is kept, or empty, as one
+
+
+class Paint(NamedTuple):
+    """Red, green, blue and 255 (0: none) at nodes near a surface, in tiles that share their outer nodes.
+
+    `slot` says where in `tiles` a tile of space is; tile 0 is the empty one.
+    """
+
+    slot: Int[Any, "a b c"]
+    tiles: UInt8[Any, "n 17 17 17 4"]
 
 
 def paint(
     grid: GridConfig, distance: Float[np.ndarray, "x y z"], keyframes: Iterable[Keyframe], camera: Camera
-) -> UInt8[np.ndarray, "u v w 4"]:
-    """Red, green, blue and 255 (0: none) at nodes `_FINER` times as dense as the map's, near its surface.
+) -> Paint:
+    """The surface of a map painted from keyframes, at nodes `_FINER` times as dense as the map's.
 
     `distance` [m] is the map's signed distance. A node's colour is the mean over the keyframes that measured
     the surface there, weighted by how many pixels a piece of it fills.
@@ -51,11 +63,10 @@ def paint(
     for keyframe in keyframes:
         total = add(total, on_device, keyframe.image, jnp.asarray(keyframe.T_world_cam, jnp.float32))
     rgb, weight = np.split(np.asarray(total), [3], axis=-1)
-    painted = weight[:, 0] > 0
-    coat = np.zeros((*(_FINER * (np.array(distance.shape) - 1) + 1), 4), np.uint8)
-    colour = np.round(255 * rgb[painted] / weight[painted])
-    coat[tuple(nodes[painted].T)] = np.concatenate([colour, np.full((len(colour), 1), 255)], axis=1)
-    return coat
+    there = weight[:, 0] > 0
+    colour = np.round(255 * rgb[there] / weight[there])
+    coat = np.concatenate([colour, np.full((len(colour), 1), 255)], axis=1).astype(np.uint8)
+    return _tiled(nodes[there], coat, _FINER * (np.array(distance.shape) - 1))
 
 
 def painted(scene: SceneField, grid: GridConfig) -> SceneField:
@@ -65,10 +76,39 @@ def painted(scene: SceneField, grid: GridConfig) -> SceneField:
         *values, coat = params
         distance, rgb = scene.query(tuple(values), point, direction)
         position = (point - jnp.asarray(grid.lower, point.dtype)) * (_FINER / grid.voxel)
-        colour, alpha = jnp.split(trilinear(coat, position) / 255, [3])
+        tile = jnp.clip(position / _TILE, 0, jnp.array(coat.slot.shape, point.dtype) - 1).astype(jnp.int32)
+        within = position - _TILE * tile.astype(point.dtype)
+        # All tiles one behind the other: a position within its own reads no other.
+        row = coat.slot[tuple(tile)] * (_TILE + 1)
+        behind = jnp.array([1, 0, 0], point.dtype) * row.astype(point.dtype)
+        tiles = coat.tiles.reshape(-1, *coat.tiles.shape[2:])
+        colour, alpha = jnp.split(trilinear(tiles, jnp.clip(within, 0, _TILE) + behind) / 255, [3])
         return distance, jnp.where(alpha > _PAINTED, colour / jnp.maximum(alpha, _PAINTED), rgb)
 
     return SceneField(scene.init, query)
+
+
+def _tiled(
+    nodes: Int[np.ndarray, "m 3"], coat: UInt8[np.ndarray, "m 4"], cells: Int[np.ndarray, "3"]
+) -> Paint:
+    """Painted nodes in tiles; a node on the side of a tile is in its neighbour too."""
+    count = -(-cells // _TILE)
+    where, within, which = [], [], []
+    for back in np.ndindex(2, 2, 2):
+        tile = nodes // _TILE - np.array(back)
+        local = nodes - _TILE * tile
+        kept = np.flatnonzero(
+            (local <= _TILE).all(axis=1) & (tile >= 0).all(axis=1) & (tile < count).all(axis=1)
+        )
+        where.append(np.ravel_multi_index(tuple(tile[kept].T), tuple(count)))
+        within.append(local[kept])
+        which.append(kept)
+    used, place = np.unique(np.concatenate(where), return_inverse=True)
+    slot = np.zeros(int(np.prod(count)), np.int32)
+    slot[used] = np.arange(1, len(used) + 1)
+    tiles = np.zeros((len(used) + 1, *(_TILE + 1,) * 3, 4), np.uint8)
+    tiles[(place + 1, *np.concatenate(within).T)] = coat[np.concatenate(which)]
+    return Paint(slot.reshape(count), tiles)
 
 
 def _coat(grid: GridConfig, distance: Float[np.ndarray, "x y z"]) -> Int[np.ndarray, "m 3"]:

@@ -198,7 +198,7 @@ def _finish(system: System, state: SlamState) -> SlamResult:
         seconds=frames.seconds,
         scene=painted(scene, state.grid),
         grid=state.grid,
-        scene_params=(values, jnp.asarray(coat)),
+        scene_params=(values, jax.tree.map(jnp.asarray, coat)),
         keyframes=keyframes,
         field=field,
         field_params=fitted.params,
