@@ -103,8 +103,8 @@ def grow(config: GridConfig, state: Any, points: np.ndarray) -> tuple[GridConfig
     pad = lambda x: jnp.pad(x, widths[x.shape[:3]]) if x.ndim == 4 else x
     larger = jax.tree.map(pad, state)
     config = replace(config, lower=_triple(lower - before * cell), upper=_triple(upper + after * cell))
-    old = pad(jnp.ones_like(state.params[0])) > 0
-    coarse = jnp.where(old, larger.params[0], jnp.broadcast_to(_free(config), old.shape))
+    old = pad(jnp.ones_like(state.params[0][..., :1], bool))
+    coarse = jnp.where(old, larger.params[0], _free(config))
     return config, larger._replace(params=(coarse, *larger.params[1:]))
 
 
