@@ -8,8 +8,8 @@ import pytest
 import jaxpose
 
 LAYERS = (
-    "errors numpy_field se3 camera nn fields motion scenes render imu events losses metrics train recording"
-    " nerf slam io data io_transforms plots command experiments commands cli"
+    "errors numpy_field se3 camera nn fields motion intrinsic scenes render imu events losses metrics train"
+    " recording nerf slam io data io_transforms plots command experiments commands cli"
 ).split()
 BESIDE = {
     "ekf": "imu",

@@ -105,10 +105,11 @@ def _flat(settings: dict[str, Any], within: str = "") -> Iterator[tuple[str, Any
 
 
 def slam_config(options: Options) -> SlamConfig:
-    """How to track; with `--smoke` a field that compiles sooner."""
+    """How to track; with `--smoke` a field that compiles sooner, and a coarse map."""
+    slam = options.slam
     if not options.smoke:
-        return options.slam
-    return replace(options.slam, field=replace(options.slam.field, layers=2, width=32))
+        return slam
+    return replace(slam, field=replace(slam.field, layers=2, width=32), voxel=slam.voxel or 0.05)
 
 
 class Source(NamedTuple):
