@@ -173,6 +173,7 @@ def played(file):
     return page, told["durationSeconds"], told["messages"]
 
 
+@pytest.mark.slow
 def test_a_saved_page_plays_the_way_of_the_camera(run, tmp_path, capsys):
     out = tmp_path / "new" / "page.html"
     cli.main(["view", str(run), "--save", str(out), "--frustums", "4"])

@@ -63,7 +63,7 @@ def test_the_intrinsic_frame_takes_what_is_common_and_leaves_every_motion_as_it_
     t = jnp.arange(1, 11, dtype=jnp.float32) / 5
     steps = np.random.default_rng(0).uniform(0.02, 0.06, 10)
     T = jnp.stack([motion((2, 4, 0), (step, 0, 0)) for step in steps])
-    net = posenet(PoseNetConfig(layers=4, width=64, activation="softplus", span=(0.0, 2.0)))
+    net = posenet(PoseNetConfig(layers=3, width=48, activation="softplus", span=(0.0, 2.0)))
     params = intrinsic(net, net).init(jax.random.key(0))
     found, T_inner = make_refit(net, net, VIEW)(params, t, T)
     before, after = effective_dof(T, VIEW), effective_dof(T_inner, VIEW)

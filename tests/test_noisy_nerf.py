@@ -153,6 +153,7 @@ def numbers(results):
     return {key: results[key] for key in keys} | {"history": history.tolist()}
 
 
+@pytest.mark.slow
 def test_a_killed_run_resumed_has_the_numbers_of_a_whole_one(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("jaxpose.experiments.noisy_nerf_setup._SMOKE", build_three_chunks())
     monkeypatch.setattr("jaxpose.experiments.joint_loop._SAVE_EVERY_S", 0.0)
