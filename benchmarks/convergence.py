@@ -8,7 +8,6 @@ Converged is where the pose stays within `--metres` and `--degrees` of the truth
 """
 
 from dataclasses import dataclass
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -16,12 +15,12 @@ import numpy as np
 import optax
 import tyro
 from timing import machine
-from tracking import CAMERA, room
+from tracking import FIELDS, make_loss, room
 
 from jaxpose import se3
-from jaxpose.fields import PoseNetConfig, pin, posenet
-from jaxpose.slam.objective import TrackConfig, image_loss, image_residuals
-from jaxpose.slam.observe import SampleConfig, sample_pixels
+from jaxpose.fields import pin, posenet
+from jaxpose.metrics import rotation_angle_deg
+from jaxpose.slam.objective import TrackConfig
 
 
 @dataclass(frozen=True)
@@ -39,13 +38,8 @@ class Config:
 
 def make_descent(scene, pose_of, rates, config: Config):
     """The compiled descent `(parameters, scene parameters, image, key) -> poses (iterations, 4, 4)`."""
-    track = TrackConfig(pixels=config.rays, sample=SampleConfig(front=32, surface=16, behind=0))
+    loss_fn = make_loss(scene, pose_of, rays=config.rays, even=32, near=16)
     adam = optax.scale_by_adam()
-
-    def loss_fn(params, scene_params, image, key):
-        pixels = sample_pixels(key, image, CAMERA, track.pixels, edge=track.edge)
-        query = partial(scene.query, scene_params)
-        return image_loss(image_residuals(query, pose_of(params), pixels, jnp.float32(8.0), track), track)
 
     @jax.jit
     def descent(params, scene_params, image, key, rate):
@@ -54,7 +48,7 @@ def make_descent(scene, pose_of, rates, config: Config):
             key, i = item
             gradient = jax.grad(loss_fn)(params, scene_params, image, key)
             direction, state = adam.update(gradient, state)
-            fall = rate * track.decay ** (i / config.iterations)
+            fall = rate * TrackConfig().decay ** (i / config.iterations)
             params = jax.tree.map(lambda p, r, d: p - fall * r * d, params, rates, direction)
             return (params, state), pose_of(params)
 
@@ -67,7 +61,7 @@ def make_descent(scene, pose_of, rates, config: Config):
 
 def converged(poses: np.ndarray, config: Config) -> float:
     """The first iteration from which on the poses are near the truth, which is the identity; inf: none."""
-    angle = np.rad2deg(np.arccos(np.clip((np.trace(poses[:, :3, :3], axis1=1, axis2=2) - 1) / 2, -1, 1)))
+    angle = rotation_angle_deg(poses[:, :3, :3], np.tile(np.eye(3), (len(poses), 1, 1)))
     near = (np.linalg.norm(poses[:, :3, 3], axis=1) < config.metres) & (angle < config.degrees)
     far = np.flatnonzero(~near)
     after = far[-1] + 1 if len(far) else 0
@@ -81,10 +75,7 @@ def main() -> None:
     sigma = np.repeat([config.off_metres, np.deg2rad(config.off_degrees)], 3)
     starts = sigma * np.random.default_rng(0).normal(size=(config.starts, 6))
     variants = {"six numbers": (lambda twist: se3.exp(twist), lambda twist: twist, jnp.ones(6))}
-    for name, settings in {
-        "PoseNet 4 x 128 softplus": PoseNetConfig(layers=4, width=128, activation="softplus"),
-        "PoseNet 8 x 256 relu": PoseNetConfig(),
-    }.items():
+    for name, settings in FIELDS.items():
         field = posenet(settings)
         first = field.init(jax.random.key(0))
         bring = jax.jit(

@@ -24,6 +24,10 @@ from jaxpose.slam.objective import TrackConfig, image_loss, image_residuals
 from jaxpose.slam.observe import Image, SampleConfig, sample_pixels
 
 CAMERA = Camera(585.0, 585.0, 320.0, 240.0, 640, 480)
+FIELDS = {
+    "PoseNet 4 x 128 softplus": PoseNetConfig(layers=4, width=128, activation="softplus"),
+    "PoseNet 8 x 256 relu": PoseNetConfig(),
+}
 HALF = np.array([2.5, 1.5, 3.0])  # [m] of the room, whose centre is where the camera is
 
 
@@ -57,17 +61,22 @@ def colour(point: np.ndarray) -> np.ndarray:
     return 0.5 + 0.4 * np.sin(3 * point)
 
 
-def make_loop(scene, pose_of, config: Config):
-    """The compiled loop `(parameters, scene parameters, image, key) -> (parameters, last loss)`."""
-    track = TrackConfig(
-        pixels=config.rays, sample=SampleConfig(front=config.even, surface=config.near, behind=0)
-    )
-    adam = optax.adam(1e-4)
+def make_loss(scene, pose_of, *, rays: int, even: int, near: int):
+    """The loss `(parameters, scene parameters, image, key)` on newly drawn pixels."""
+    track = TrackConfig(pixels=rays, sample=SampleConfig(front=even, surface=near, behind=0))
 
     def loss_fn(params, scene_params, image, key):
         pixels = sample_pixels(key, image, CAMERA, track.pixels, edge=track.edge)
         query = partial(scene.query, scene_params)
         return image_loss(image_residuals(query, pose_of(params), pixels, jnp.float32(8.0), track), track)
+
+    return loss_fn
+
+
+def make_loop(scene, pose_of, config: Config):
+    """The compiled loop `(parameters, scene parameters, image, key) -> (parameters, last loss)`."""
+    loss_fn = make_loss(scene, pose_of, rays=config.rays, even=config.even, near=config.near)
+    adam = optax.adam(1e-4)
 
     @jax.jit
     def loop(params, scene_params, image, key):
@@ -88,13 +97,9 @@ def main() -> None:
     config = tyro.cli(Config, description=__doc__)
     scene, scene_params, image = room()
     key = jax.random.key(0)
-    fields = {
-        "PoseNet 4 x 128 softplus": PoseNetConfig(layers=4, width=128, activation="softplus"),
-        "PoseNet 8 x 256 relu": PoseNetConfig(),
-    }
     start = jnp.array([0.02, -0.01, 0.03, 0.01, -0.02, 0.01])
     variants = {"six numbers": (lambda twist: se3.exp(twist), start)}
-    for name, settings in fields.items():
+    for name, settings in FIELDS.items():
         field = posenet(settings)
         variants[name] = (lambda params, field=field: field.pose(params, jnp.float32(0.5)), field.init(key))
     loops = {
@@ -107,7 +112,7 @@ def main() -> None:
     print(f"{config.rays} rays x {config.even + config.near} samples, {nodes} nodes, per iteration:")
     for name, taken in times.items():
         print(f"  {name:26s}{milliseconds(taken)}")
-    for name in fields:
+    for name in FIELDS:
         # Differences of neighbours in time: what drifts goes out.
         print(f"  {name + ' adds':31s}{milliseconds(times[name] - times['six numbers'])}")
 

@@ -5,8 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.testing import assert_allclose
 from scipy.ndimage import map_coordinates
+from wall import rays
 
-from jaxpose.camera import Camera, pixel_direction
+from jaxpose.camera import Camera
 from jaxpose.scenes import GridConfig, grid, node_positions
 from jaxpose.slam.keyframes import Keyframe
 from jaxpose.slam.observe import Image
@@ -28,13 +29,12 @@ def keyframe(index, x):
     """A camera at (x, 0, 0) that looks at the wall."""
     T = np.eye(4)
     T[0, 3] = x
-    column, row = np.meshgrid(np.arange(160), np.arange(120))
-    rays = np.asarray(pixel_direction(CAMERA, jnp.asarray(np.stack([column, row], -1), jnp.float32)))
-    rgb = np.round(255 * picture(x + WALL_Z * rays[..., 0], WALL_Z * rays[..., 1])).astype(np.uint8)
+    across, down, _ = np.moveaxis(WALL_Z * rays(CAMERA), -1, 0)
+    rgb = np.round(255 * picture(x + across, down)).astype(np.uint8)
     return Keyframe(index, Image(jnp.asarray(rgb), jnp.full((120, 160), WALL_Z, jnp.float32)), T)
 
 
-def wall():
+def wall_values():
     """The values of a grey map with the wall's distance."""
     distance = np.clip(WALL_Z - node_positions(GRID)[..., 2], -0.12, 0.12)
     return np.concatenate([distance[..., None], np.full((*distance.shape, 3), 0.5)], axis=-1).astype(
@@ -43,12 +43,12 @@ def wall():
 
 
 def seen_at(points, coat):
-    scene, params = painted(grid(GRID), GRID), (jnp.asarray(wall()), jax.tree.map(jnp.asarray, coat))
+    scene, params = painted(grid(GRID), GRID), (jnp.asarray(wall_values()), jax.tree.map(jnp.asarray, coat))
     return jax.vmap(lambda p: scene.query(params, p, jnp.zeros(3)))(jnp.asarray(points, jnp.float32))
 
 
 def test_a_wall_is_painted_finer_than_the_cells():
-    coat = paint(GRID, wall()[..., 0], [keyframe(0, -0.05), keyframe(1, 0.05)], CAMERA)
+    coat = paint(GRID, wall_values()[..., 0], [keyframe(0, -0.05), keyframe(1, 0.05)], CAMERA)
     rng = np.random.default_rng(0)
     xy = rng.uniform([-0.25, -0.2], [0.25, 0.2], (300, 2))
     distance, rgb = seen_at(np.column_stack([xy, np.full(300, WALL_Z)]), coat)
@@ -62,9 +62,9 @@ def test_a_wall_is_painted_finer_than_the_cells():
 def test_what_no_keyframe_saw_keeps_the_colour_of_the_map():
     away = np.diag([1.0, -1, -1, 1])
     for keyframes in ([], [keyframe(0, 0.0)._replace(T_world_cam=away)]):
-        coat = paint(GRID, wall()[..., 0], keyframes, CAMERA)
+        coat = paint(GRID, wall_values()[..., 0], keyframes, CAMERA)
         assert coat.tiles.shape[0] == 1 and not coat.tiles.any() and not coat.slot.any()
-    coat = paint(GRID, wall()[..., 0], [keyframe(0, 0.0)], CAMERA)
+    coat = paint(GRID, wall_values()[..., 0], [keyframe(0, 0.0)], CAMERA)
     assert coat.slot.shape == (2, 2, 2) and set(np.unique(coat.tiles[..., 3])) == {0, 255}
     _, rgb = seen_at([[0.0, 0.0, WALL_Z - 0.1], [0.0, 0.0, WALL_Z + 0.1]], coat)
     assert_allclose(rgb, 0.5, atol=1e-6)
@@ -74,7 +74,7 @@ def test_a_keyframe_that_sees_something_else_there_paints_nothing():
     """A table in front of the wall, which the map does not hold: its colour does not land on the wall."""
     nearer = keyframe(0, 0.0)
     nearer = nearer._replace(image=nearer.image._replace(depth=nearer.image.depth - 0.2))
-    assert not paint(GRID, wall()[..., 0], [nearer], CAMERA).tiles.any()
+    assert not paint(GRID, wall_values()[..., 0], [nearer], CAMERA).tiles.any()
 
 
 def test_tiles_hold_what_a_dense_array_would():

@@ -5,24 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from wall import CAMERA, rays, wall
 
-from jaxpose.camera import Camera, pixel_direction
+from jaxpose.camera import Camera
 from jaxpose.slam.observe import Image, depth_sigma, locate
 from jaxpose.slam.planes import seen_by, tangent_planes
 
-CAMERA = Camera(60.0, 60.0, 31.5, 23.5, 64, 48)
 ACROSS = np.array([0.0, 0, -1])
-
-
-def rays(camera=CAMERA):
-    column, row = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-    return np.asarray(pixel_direction(camera, jnp.asarray(np.stack([column, row], -1), jnp.float32)))
-
-
-def wall(normal, distance, camera=CAMERA):
-    """Depth of the plane normal . x + distance = 0, and the unit normal."""
-    normal = np.asarray(normal) / np.linalg.norm(normal)
-    return (-distance / (rays(camera) @ normal)).astype(np.float32), normal
 
 
 def planes(depth, camera=CAMERA):

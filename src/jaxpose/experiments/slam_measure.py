@@ -48,6 +48,26 @@ class Accuracy(NamedTuple):
     numbers: dict[str, Any]
 
 
+class Measured(NamedTuple):
+    """What there was to measure: errors against a truth, an IMU against the field, the intrinsic motion."""
+
+    errors: Accuracy | None
+    inertial: Inertial | None
+    freedom: Freedom | None
+
+    def numbers(self) -> dict[str, Any]:
+        """All of them for the results."""
+        found: dict[str, Any] = {}
+        if self.freedom is not None:
+            found["degrees_of_freedom"] = self.freedom.numbers
+        if self.errors is not None:
+            found |= self.errors.numbers
+        if self.inertial is not None:
+            found["field_gyro_rms_rad_s"] = self.inertial.gyro_rms
+            found["field_accelerometer_rms_m_s2"] = self.inertial.accelerometer_rms
+        return found
+
+
 def cost(result: SlamResult) -> dict[str, Any]:
     """What tracking cost and how it went."""
     settled = result.seconds[2:]  # the first two compile

@@ -19,7 +19,7 @@ from jaxpose.errors import DataError
 from jaxpose.experiments import slam_checkpoint
 from jaxpose.experiments.slam_keep import keeper
 from jaxpose.experiments.slam_map import Renderer, SavedMap, map_quality, renderer, views, write_map
-from jaxpose.experiments.slam_measure import Accuracy, Inertial, accuracy, cost, freedom, inertial
+from jaxpose.experiments.slam_measure import Measured, accuracy, cost, freedom, inertial
 from jaxpose.experiments.slam_options import Options, Source, decisive, load, slam_config
 from jaxpose.experiments.slam_report import table
 from jaxpose.fields import Params, PoseField, bspline
@@ -107,7 +107,7 @@ def _single(
     experiment: str, options: Options, source: Source, folder: Path, on_frame: OnFrame | None, started: float
 ) -> tuple[dict[str, Any], Float[np.ndarray, " n"]]:
     """One tracked run, written: its results, and the translation error [m] of every frame."""
-    recording, mode, truth = source.recording, options.slam.imu, source.recording.T_world_cam
+    recording, mode = source.recording, options.slam.imu
     checkpoint, finished = folder / "checkpoint.npz", folder / "results.json"
     if not command.resumes(folder, folder / "settings.json", decisive(options), options.resume):
         checkpoint.unlink(missing_ok=True)
@@ -125,31 +125,21 @@ def _single(
             on_frame(mode, progress)
 
     result = track(recording, config, done, state)
+    results, errors = _written(experiment, options, source, folder, result, started)
+    io.write_json(finished, results)  # with it the run counts as finished
+    checkpoint.unlink(missing_ok=True)
+    return results, errors
+
+
+def _written(
+    experiment: str, options: Options, source: Source, folder: Path, result: SlamResult, started: float
+) -> tuple[dict[str, Any], Float[np.ndarray, " n"]]:
+    """A tracked recording measured and written, all but its results; the translation error of every frame."""
+    recording, mode, truth = source.recording, options.slam.imu, source.recording.T_world_cam
     errors = None if truth is None else accuracy(result, recording.t, truth)
-    motion = inertial(recording, result)
+    measured = Measured(errors, inertial(recording, result), freedom(recording, result))
     render = renderer(recording, result)
-    results = {
-        "experiment": experiment,
-        "data": source.about,
-        "imu": {"mode": mode, "readings": "not used" if mode == "none" else source.imu},
-        "frame_of_reference": options.slam.frame,
-        "seed": options.slam.seed,
-        "smoke": options.smoke,
-        **cost(result),
-    }
-    few = freedom(recording, result)
-    if few is not None:
-        results |= {"degrees_of_freedom": few.numbers}
-        title = f"{recording.name}: motion from frame to frame, before and in the intrinsic frame"
-        plots.freedom(folder / "freedom.png", recording.t[1:], few.before, few.after, title)
-    if errors is not None:
-        results |= errors.numbers
-    if motion is not None:
-        results |= {
-            "field_gyro_rms_rad_s": motion.gyro_rms,
-            "field_accelerometer_rms_m_s2": motion.accelerometer_rms,
-        }
-    _draw(folder, f"{recording.name}, IMU {mode}", recording, result, render, errors, motion)
+    _draw(folder, f"{recording.name}, IMU {mode}", recording, result, render, measured)
     io.write_tum(folder / "trajectory.txt", io.Trajectory(recording.t, result.T_world_cam))
     if truth is not None:
         io.write_tum(folder / "reference.txt", io.Trajectory(recording.t, truth))
@@ -161,15 +151,21 @@ def _single(
     notes = (*recording.notes, *_write_surface(folder, recording, result))
     write_camera(folder / "camera.json", recording.camera, recording.files, images_folder)
     io.write_json(folder / "config.json", options)
-    results |= {
+    results = {
+        "experiment": experiment,
+        "data": source.about,
+        "imu": {"mode": mode, "readings": "not used" if mode == "none" else source.imu},
+        "frame_of_reference": options.slam.frame,
+        "seed": options.slam.seed,
+        "smoke": options.smoke,
+        **cost(result),
+        **measured.numbers(),
         "map": map_quality(result, render),
         "notes": notes,
         "versions": io.versions(),
         "wall_s": time.perf_counter() - started,
         "peak_rss_bytes": io.peak_rss_bytes(),
     }
-    io.write_json(finished, results)  # with it the run counts as finished
-    checkpoint.unlink(missing_ok=True)
     return results, np.full(len(recording.t), np.nan) if errors is None else errors.translation_m
 
 
@@ -200,10 +196,10 @@ def _draw(
     recording: Recording,
     result: SlamResult,
     render: Renderer,
-    errors: Accuracy | None,
-    motion: Inertial | None,
+    measured: Measured,
 ) -> None:
     """The pictures of a run, poses aligned as their errors are."""
+    errors, motion, freed = measured
     name = f"{name}, {len(recording.t)} frames"
     if errors is None:
         title = f"{name}: no truth to compare with"
@@ -222,6 +218,9 @@ def _draw(
     if motion is not None:
         title = f"{name}: IMU against the derivatives of the final field"
         plots.inertial(folder / "inertial.png", motion.t, motion.gyro, motion.accelerometer, title)
+    if freed is not None:
+        title = f"{recording.name}: motion from frame to frame, before and in the intrinsic frame"
+        plots.freedom(folder / "freedom.png", recording.t[1:], freed.before, freed.after, title)
 
 
 def load_field(folder: Path | str) -> tuple[PoseField, Params]:

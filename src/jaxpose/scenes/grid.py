@@ -113,16 +113,11 @@ def node_shape(config: GridConfig) -> Int[np.ndarray, "3"]:
     return _coarse_cells(config) * RATIO ** (config.levels - 1) + 1
 
 
-def node_axes(config: GridConfig) -> tuple[Float[np.ndarray, " n"], ...]:
-    """World positions [m] of the nodes of the finest level along x, y and z."""
-    cells = _coarse_cells(config) * RATIO ** (config.levels - 1)
-    axes = [low + config.voxel * np.arange(n + 1) for low, n in zip(config.lower, cells, strict=True)]
-    return tuple(axis.astype(np.float32) for axis in axes)
-
-
 def node_positions(config: GridConfig) -> Float[np.ndarray, "x y z 3"]:
     """World positions [m] of the nodes of the finest level."""
-    return np.stack(np.meshgrid(*node_axes(config), indexing="ij"), axis=-1)
+    shape = node_shape(config)
+    axes = [low + config.voxel * np.arange(n) for low, n in zip(config.lower, shape, strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).astype(np.float32)
 
 
 def merge(params: Params) -> Params:

@@ -6,8 +6,8 @@ both methods are in experiments/. A distance is that to the plane which touches 
 that views from different sides agree about it.
 
 The scene's distance is cut off close behind surfaces, as thin things have two sides. Beside it the map has a
-second one that reaches farther to both sides, and keeps where anything was measured: a camera is aligned to
-that one (`look_up`), from farther off.
+second one that reaches farther to both sides, and keeps where anything was measured: by that one a
+camera is aligned from farther off (`look_up`).
 """
 
 from collections.abc import Callable
@@ -26,7 +26,7 @@ from jaxpose.scenes.base import Params
 from jaxpose.scenes.grid import trilinear
 from jaxpose.slam.mapping import MapState
 from jaxpose.slam.observe import Image, locate
-from jaxpose.slam.planes import GRAZING, seen_by
+from jaxpose.slam.planes import GRAZING, Seen, seen_by
 
 _MEMORY = 100.0  # frames, at a depth of one metre: older ones are slowly forgotten
 _REACH = 8  # voxels to either side of a surface of which the wide distance knows
@@ -43,6 +43,14 @@ class Nearby(NamedTuple):
     known: Float[Array, ""]
 
 
+class _Reach(NamedTuple):
+    """How far [m] behind a surface distances count: the scene's, any beside it, and the wide ones."""
+
+    band: float
+    beside: float
+    wide: float
+
+
 Lookup = Callable[[Float[Array, "3"]], Nearby]
 
 
@@ -53,7 +61,7 @@ def make_fuse(config: GridConfig, camera: Camera, band: float):
     (x, y, z, 5) holds the weights of distance, colour and wide distance, then the wide distance [m] and 1
     where it is known.
     """
-    reach, beside = _REACH * config.voxel, _BESIDE * config.voxel
+    reach = _Reach(band, _BESIDE * config.voxel, _REACH * config.voxel)
     lower, shape = np.asarray(config.lower, np.float32), node_shape(config)
     tile = np.minimum(_TILE, shape)
     starts = np.moveaxis(np.mgrid[tuple(map(slice, np.zeros(3, int), shape, tile))], 0, -1).reshape(-1, 3)
@@ -61,35 +69,10 @@ def make_fuse(config: GridConfig, camera: Camera, band: float):
     corners = jnp.asarray(lower + config.voxel * corners, jnp.float32)
     in_view = _cone(camera)
 
-    def fused(values, memory, points_cam, own, seen_at):
-        """Nodes with what an image says of them added; those that are not `own` stay as they are."""
-        at = locate(camera, points_cam)
-        seen = seen_at(at)
-        distance = seen.distance(points_cam)
-        # How far behind a surface a node is goes by the optical axis, as little is known there at a grazing
-        # angle; but the nodes next to it are needed on both sides.
-        along = distance * at.depth / jnp.maximum(seen.facing(points_cam), GRAZING * at.depth)
-        along = jnp.where(jnp.abs(distance) < beside, distance, along)
-        worth = jnp.where(own, seen.worth, 0)
-        gain = jnp.stack([
-            jnp.where(along > -band, worth, 0),
-            jnp.where(jnp.abs(along) < band, worth, 0),
-            jnp.where(along > -reach, worth, 0),
-        ], axis=-1)  # fmt: skip
-        weight, wide, known = memory[..., :3], memory[..., 3], memory[..., 4]
-        total = weight + gain
-        share = gain / jnp.where(total > 0, total, 1)
-        found = jnp.concatenate([jnp.minimum(distance, band)[..., None], seen.rgb], axis=-1)
-        values = values + share[..., jnp.array([0, 1, 1, 1])] * (found - values)
-        wide = wide + share[..., 2] * (jnp.minimum(distance, reach) - wide)
-        known = jnp.where(gain[..., 2] > 0, 1, known)
-        memory = [jnp.minimum(total, _MEMORY), wide[..., None], known[..., None]]
-        return values, jnp.concatenate(memory, axis=-1)
-
     @partial(jax.jit, donate_argnums=0)
     def update(state: MapState, image: Image, T_world_cam: Float[Array, "4 4"]) -> MapState:
         seen_at, T_cam_world = seen_by(image, camera), se3.inverse(T_world_cam)
-        in_sight = in_view(se3.apply(T_cam_world, corners), jnp.max(image.depth) + reach)
+        in_sight = in_view(se3.apply(T_cam_world, corners), jnp.max(image.depth) + reach.wide)
         order = jnp.asarray(starts)[jnp.argsort(~in_sight)]  # those in sight come first
 
         def fuse_tile(n, maps):
@@ -100,7 +83,10 @@ def make_fuse(config: GridConfig, camera: Camera, band: float):
             own = jnp.all(index >= order[n].reshape(1, 1, 1, 3), axis=-1)
             points = jnp.asarray(lower).reshape(1, 1, 1, 3) + config.voxel * index.astype(jnp.float32)
             values, memory = (jax.lax.dynamic_slice(m, (*first, 0), (*tile, m.shape[3])) for m in maps)
-            parts = fused(values, memory, se3.apply(T_cam_world, points), own, seen_at)
+            points_cam = se3.apply(T_cam_world, points)
+            seen = seen_at(locate(camera, points_cam))
+            seen = seen._replace(worth=jnp.where(own, seen.worth, 0))
+            parts = _fused(values, memory, points_cam, seen, reach)
             return tuple(
                 jax.lax.dynamic_update_slice(m, part, (*first, 0))
                 for m, part in zip(maps, parts, strict=True)
@@ -111,6 +97,35 @@ def make_fuse(config: GridConfig, camera: Camera, band: float):
         return MapState(maps[:1], maps[1])
 
     return lambda params: MapState(params, jnp.zeros((*params[0].shape[:3], 5))), update
+
+
+def _fused(
+    values: Float[Array, "*n 4"],
+    memory: Float[Array, "*n 5"],
+    points_cam: Float[Array, "*n 3"],
+    seen: Seen,
+    reach: _Reach,
+) -> tuple[Float[Array, "*n 4"], Float[Array, "*n 5"]]:
+    """Nodes at points in camera axes with what an image says of them added."""
+    distance, depth = seen.distance(points_cam), points_cam[..., 2]
+    # How far behind a surface a node is goes by the optical axis, as little is known there at a grazing
+    # angle; but the nodes next to it are needed on both sides.
+    along = distance * depth / jnp.maximum(seen.facing(points_cam), GRAZING * depth)
+    along = jnp.where(jnp.abs(distance) < reach.beside, distance, along)
+    gain = jnp.stack([
+        jnp.where(along > -reach.band, seen.worth, 0),
+        jnp.where(jnp.abs(along) < reach.band, seen.worth, 0),
+        jnp.where(along > -reach.wide, seen.worth, 0),
+    ], axis=-1)  # fmt: skip
+    weight, wide, known = memory[..., :3], memory[..., 3], memory[..., 4]
+    total = weight + gain
+    share = gain / jnp.where(total > 0, total, 1)
+    found = jnp.concatenate([jnp.minimum(distance, reach.band)[..., None], seen.rgb], axis=-1)
+    values = values + share[..., jnp.array([0, 1, 1, 1])] * (found - values)
+    wide = wide + share[..., 2] * (jnp.minimum(distance, reach.wide) - wide)
+    known = jnp.where(gain[..., 2] > 0, 1, known)
+    memory = jnp.concatenate([jnp.minimum(total, _MEMORY), wide[..., None], known[..., None]], axis=-1)
+    return values, memory
 
 
 def _cone(camera: Camera) -> Callable[[Float[Array, "m 8 3"], Float[Array, ""]], Bool[Array, " m"]]:
@@ -140,7 +155,6 @@ def look_up(
         return Nearby(distance, rgb, (jnp.abs(distance) < _CUT * config.truncation).astype(distance.dtype))
     *_, far, known = trilinear(memory, (point - jnp.asarray(config.lower, point.dtype)) / config.voxel)
     measured = (known > 1 - 1e-3) & (jnp.abs(far) < _CUT * _REACH * config.voxel)
-    whole = (jnp.abs(distance) < config.truncation - _BESIDE * config.voxel) & (
-        jnp.abs(far) < config.truncation - config.voxel
-    )
+    whole = jnp.abs(distance) < config.truncation - _BESIDE * config.voxel
+    whole &= jnp.abs(far) < config.truncation - config.voxel
     return Nearby(jnp.where(whole, distance, far), rgb, measured.astype(distance.dtype))

@@ -97,9 +97,7 @@ def _tiled(
     for back in np.ndindex(2, 2, 2):
         tile = nodes // _TILE - np.array(back)
         local = nodes - _TILE * tile
-        kept = np.flatnonzero(
-            (local <= _TILE).all(axis=1) & (tile >= 0).all(axis=1) & (tile < count).all(axis=1)
-        )
+        kept = np.flatnonzero(((local <= _TILE) & (tile >= 0) & (tile < count)).all(axis=1))
         where.append(np.ravel_multi_index(tuple(tile[kept].T), tuple(count)))
         within.append(local[kept])
         which.append(kept)

@@ -37,10 +37,8 @@ class Seen(NamedTuple):
 
 def seen_by(image: Image, camera: Camera) -> Callable[[Located], Seen]:
     """What an image says at located points, ready to be asked: one row is read for each."""
-    column, row = jnp.meshgrid(jnp.arange(camera.width), jnp.arange(camera.height))
-    direction = pixel_direction(camera, jnp.stack([column, row], axis=-1).astype(image.depth.dtype))
     planes = tangent_planes(image.depth, camera)
-    cosine = -jnp.sum(planes[..., :3] * direction, axis=-1) / jnp.linalg.norm(direction, axis=-1)
+    cosine = _cosine(planes[..., :3], _directions(camera))
     near = (depth_sigma(jnp.ones(())) / depth_sigma(image.depth)) ** 2
     worth = jnp.where(image.depth > 0, near * jnp.maximum(cosine, GRAZING), 0)
     rows = jnp.concatenate([planes, worth[..., None], image.rgb.astype(planes.dtype) / 255], axis=-1)
@@ -60,8 +58,7 @@ def tangent_planes(depth: Float[Array, "h w"], camera: Camera) -> Float[Array, "
     that no slope is taken across an edge. Where there is no such pair, or the surface is seen at a grazing
     angle, the plane is the one across the optical axis, n = (0, 0, -1).
     """
-    column, row = jnp.meshgrid(jnp.arange(camera.width), jnp.arange(camera.height))
-    direction = pixel_direction(camera, jnp.stack([column, row], axis=-1).astype(depth.dtype))
+    direction = _directions(camera)
     seen = depth > 0
     inverse = jnp.where(seen, 1 / jnp.where(seen, depth, 1), 0)
     near = _SAME_SURFACE * depth_sigma(depth) * inverse**2
@@ -71,10 +68,20 @@ def tangent_planes(depth: Float[Array, "h w"], camera: Camera) -> Float[Array, "
     along = -jnp.stack([x, y, inverse - x * direction[..., 0] - y * direction[..., 1]], axis=-1)
     normal = along / jnp.maximum(jnp.linalg.norm(along, axis=-1, keepdims=True), 1e-9)
     point = depth[..., None] * direction
-    cosine = -jnp.sum(normal * direction, axis=-1) / jnp.linalg.norm(direction, axis=-1)
-    plane = (known_x & known_y & seen & (cosine > GRAZING))[..., None]
+    plane = (known_x & known_y & seen & (_cosine(normal, direction) > GRAZING))[..., None]
     normal = jnp.where(plane, normal, jnp.array([0.0, 0.0, -1.0], depth.dtype))
     return jnp.concatenate([normal, -jnp.sum(normal * point, axis=-1, keepdims=True)], axis=-1)
+
+
+def _directions(camera: Camera) -> Float[Array, "h w 3"]:
+    """The rays of all pixels in camera axes (z = 1)."""
+    column, row = jnp.meshgrid(jnp.arange(camera.width), jnp.arange(camera.height))
+    return pixel_direction(camera, jnp.stack([column, row], axis=-1).astype(jnp.float32))
+
+
+def _cosine(normal: Float[Array, "h w 3"], direction: Float[Array, "h w 3"]) -> Float[Array, "h w"]:
+    """Of the angle of incidence."""
+    return -jnp.sum(normal * direction, axis=-1) / jnp.linalg.norm(direction, axis=-1)
 
 
 def _slope(inverse: Float[Array, "h w"], near: Float[Array, "h w"], axis: int):
