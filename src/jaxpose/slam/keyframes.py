@@ -3,13 +3,12 @@
 from collections.abc import Iterator
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
 from jaxpose.camera import Camera
 from jaxpose.recording import Frame, Recording
-from jaxpose.slam.observe import Image
+from jaxpose.slam.observe import Image, to_device
 
 
 class Keyframe(NamedTuple):
@@ -28,9 +27,7 @@ def read_keyframes(
     `T_world_cam` holds the poses of all frames.
     """
     for i in indices.tolist():
-        frame = recording.read(i)
-        image = Image(jnp.asarray(frame.rgb), jnp.asarray(frame.depth, jnp.float32))
-        yield Keyframe(i, image, T_world_cam[i])
+        yield Keyframe(i, to_device(recording.read(i)), T_world_cam[i])
 
 
 def look(frame: Frame) -> Float[np.ndarray, "2 12 16"]:

@@ -1,5 +1,7 @@
 """Where the camera is at the next frame: predicted, searched for if that may be far off, and tracked."""
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -40,6 +42,16 @@ _LEAST_DEPTH = 0.01  # share of an image
 _FADING_S = 0.5  # in which a speed that nothing senses is forgotten
 
 
+class Ahead(NamedTuple):
+    """What is expected of the motion since the last frame, before this frame's image is looked at."""
+
+    dt: float  # [s]
+    stamps: Float[np.ndarray, " k"]  # [s] since the last frame, up to dt
+    T_ref_body: Float[np.ndarray, "k 4 4"]
+    sigma: Float[np.ndarray, "2"]  # [m, rad] how far off it may be at dt
+    readings: Readings
+
+
 def next_pose(
     system: System,
     state: SlamState,
@@ -49,28 +61,16 @@ def next_pose(
     key: PRNGKeyArray,
 ) -> SlamState:
     """The state with the next frame's pose: tracked, or predicted and marked as lost."""
-    config, t, i = system.config, system.recording.t, state.done
-    dt = float(t[i] - t[i - 1])
-    readings = system.readings(
-        i - 1, state.frames.T_world_body[i - 1], state.gyro_bias, state.false_acceleration
-    )
-    stamps, poses = predict(
-        dt, state.twist, state.velocity_body, readings,
-        rotation=config.senses_rotation, speed=config.senses_speed,
-    )  # fmt: skip
-    predicted, sigma = poses[-1], _sigma(config, state, dt, poses[-1])
-    reach = _reach(system, state, sigma, dt)
+    config, ahead = system.config, _ahead(system, state)
+    reach = _reach(system, state, ahead)
     if np.mean(frame.depth > 0) < _LEAST_DEPTH:
-        return _moved(system, state, state.frames, dt, readings, predicted, None, lost=True)
-    frames, tracked, lost = state.frames, None, True
+        return _moved(system, state, state.frames, ahead, None, lost=True)
+    frames, expected, tracked, lost = state.frames, ahead, None, True
     for wide, try_key in zip((False, True), jax.random.split(key), strict=True):
         if wide:
-            frames, T_ref_body = _searched(system, state, frame, image, predicted, reach, try_key)
-            twist = np.asarray(se3.log(jnp.asarray(T_ref_body, jnp.float32)))
-            stamps = dt * np.arange(1, len(stamps) + 1) / len(stamps)
-            poses = np.asarray(se3.exp(jnp.asarray(stamps[:, None] / dt * twist, jnp.float32)), np.float64)
-            sigma = np.minimum(sigma, FOUND_SIGMA)
-        interval = _interval(system, frames, i - 1, dt, stamps, poses, sigma, readings)
+            frames, found = _searched(system, state, frame, image, ahead.T_ref_body[-1], reach, try_key)
+            expected = _straight(ahead, found)
+        interval = _interval(system, frames, state.done - 1, expected)
         tracked = _track(system, state, frames, interval, image, generator, try_key)
         lost = _failed(system, state, tracked, reach)
         if not lost:
@@ -78,22 +78,38 @@ def next_pose(
     assert tracked is not None
     unknown_place = lost and tracked.valid < config.track.minimum_valid
     if unknown_place and config.senses_speed and max(reach) < _RECKONED:
-        return _moved(system, state, state.frames, dt, readings, predicted, None, lost=False)
-    return _moved(system, state, frames, dt, readings, predicted, tracked, lost)
+        return _moved(system, state, state.frames, ahead, None, lost=False)
+    return _moved(system, state, frames, ahead, tracked, lost)
+
+
+def _ahead(system: System, state: SlamState) -> Ahead:
+    """By constant speed or the readings."""
+    config, t, last = system.config, system.recording.t, state.done - 1
+    dt = float(t[last + 1] - t[last])
+    readings = system.readings(
+        last, state.frames.T_world_body[last], state.gyro_bias, state.false_acceleration
+    )
+    stamps, T_ref_body = predict(
+        dt, state.twist, state.velocity_body, readings,
+        rotation=config.senses_rotation, speed=config.senses_speed,
+    )  # fmt: skip
+    return Ahead(dt, stamps, T_ref_body, _sigma(config, state, dt, T_ref_body[-1]), readings)
+
+
+def _straight(ahead: Ahead, found: Float[np.ndarray, "4 4"]) -> Ahead:
+    """At one speed to a motion that a search has found."""
+    twist = np.asarray(se3.log(jnp.asarray(found, jnp.float32)))
+    share = np.arange(1, len(ahead.stamps) + 1) / len(ahead.stamps)
+    T_ref_body = np.asarray(se3.exp(jnp.asarray(share[:, None] * twist, jnp.float32)), np.float64)
+    sigma = np.minimum(ahead.sigma, FOUND_SIGMA)
+    return ahead._replace(stamps=ahead.dt * share, T_ref_body=T_ref_body, sigma=sigma)
 
 
 def _moved(
-    system: System,
-    state: SlamState,
-    frames: Frames,
-    dt: float,
-    readings: Readings,
-    predicted: Float[np.ndarray, "4 4"],
-    tracked: Tracked | None,
-    lost: bool,
+    system: System, state: SlamState, frames: Frames, ahead: Ahead, tracked: Tracked | None, lost: bool
 ) -> SlamState:
     """The state after an interval: with the tracked motion, or with the predicted one where that is lost."""
-    config, i = system.config, state.done
+    config, i, dt, predicted = system.config, state.done, ahead.dt, ahead.T_ref_body[-1]
     if tracked is None or lost:  # neither: reckoned from the IMU
         frames, T_ref_body, params = state.frames, predicted, state.params
     else:
@@ -122,7 +138,7 @@ def _moved(
             sigma=tracked.sigma,
         )
     fade = np.exp(-dt / _FADING_S) if lost else 1.0
-    velocity_body = end_velocity(dt, T_ref_body, readings, speed=config.senses_speed)
+    velocity_body = end_velocity(dt, T_ref_body, ahead.readings, speed=config.senses_speed)
     return state._replace(
         frames=frames,
         twist=fade * np.asarray(se3.log(jnp.asarray(T_ref_body, jnp.float32)), np.float64) / dt,
@@ -156,16 +172,16 @@ def _sigma(config: SlamConfig, state: SlamState, dt: float, predicted: Float[np.
     return sigma
 
 
-def _reach(system: System, state: SlamState, sigma: np.ndarray, dt: float) -> np.ndarray:
+def _reach(system: System, state: SlamState, ahead: Ahead) -> np.ndarray:
     """How far [m, rad] to search: what a hand's change of speed adds, and the time since a pose was found.
 
     Infinite where nothing is known any more.
     """
-    config, t, i = system.config, system.recording.t, state.done
+    config, t, i, dt = system.config, system.recording.t, state.done, ahead.dt
     blind = t[i - 1] - t[_last_found(state.frames, i)]
     metres = 0.05 * blind + 0.02 * blind**2 if config.senses_speed else 0.25 * dt**2 + 0.3 * blind
     radians = 0.005 * blind if config.senses_rotation else 0.5 * dt**2 + 0.3 * blind
-    reach = sigma + [metres, radians]
+    reach = ahead.sigma + [metres, radians]
     return np.where(reach < _FARTHEST, reach, np.inf)
 
 
@@ -223,27 +239,18 @@ def _bent(frames: Frames, t: np.ndarray, last: int, i: int, T_predicted_found: n
     return frames.put(lost, T_world_body=frames.T_world_body[lost] @ correction)
 
 
-def _interval(
-    system: System,
-    frames: Frames,
-    last: int,
-    dt: float,
-    stamps: np.ndarray,
-    poses: np.ndarray,
-    sigma: np.ndarray,
-    readings: Readings,
-) -> Interval:
+def _interval(system: System, frames: Frames, last: int, ahead: Ahead) -> Interval:
     """What tracking the next frame starts from."""
     t, T_world_body = system.recording.t, frames.T_world_body
     behind = [max(last - k, 0) for k in range(BEHIND + 1)]  # the last frame itself, and those before
     past = np.linalg.inv(T_world_body[last]) @ T_world_body[behind]
     as_float = lambda x: jnp.asarray(x, jnp.float32)
     return Interval(
-        as_float(dt),
-        as_float(np.concatenate([stamps, t[behind] - t[last]])),
-        as_float(np.concatenate([poses, past])),
-        as_float(sigma),
-        readings,
+        as_float(ahead.dt),
+        as_float(np.concatenate([ahead.stamps, t[behind] - t[last]])),
+        as_float(np.concatenate([ahead.T_ref_body, past])),
+        as_float(ahead.sigma),
+        ahead.readings,
     )
 
 

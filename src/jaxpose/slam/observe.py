@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt8
 
 from jaxpose import render, se3
 from jaxpose.camera import Camera, pixel_direction, project
+from jaxpose.recording import Frame
 from jaxpose.render import Query, Ray, Rendered
 
 
@@ -18,6 +19,11 @@ class Image(NamedTuple):
 
     rgb: UInt8[Array, "h w 3"]
     depth: Float[Array, "h w"]
+
+
+def to_device(frame: Frame) -> Image:
+    """A frame where it is computed with."""
+    return Image(jnp.asarray(frame.rgb), jnp.asarray(frame.depth, jnp.float32))
 
 
 class Pixels(NamedTuple):

@@ -16,7 +16,7 @@ from jaxpose.scenes import GridConfig, SceneField
 from jaxpose.slam.config import ImuMode, SlamConfig
 from jaxpose.slam.keyframes import read_keyframes
 from jaxpose.slam.localise import next_pose
-from jaxpose.slam.observe import Image
+from jaxpose.slam.observe import to_device
 from jaxpose.slam.paint import paint, painted
 from jaxpose.slam.predict import GYRO_BIAS_SIGMA
 from jaxpose.slam.reframe import Refit, due, window
@@ -111,7 +111,7 @@ def step(system: System, state: SlamState, frame: Frame) -> SlamState:
     recording, config, i = system.recording, system.config, state.done
     generator = np.random.default_rng([config.seed, i])
     key, track_key, map_key = jax.random.split(state.key, 3)
-    image = Image(jnp.asarray(frame.rgb), jnp.asarray(frame.depth, jnp.float32))
+    image = to_device(frame)
     if i > 0:
         state = next_pose(system, state, frame, image, generator, track_key)
     if system.refit is not None and due(i, len(recording.t)):
