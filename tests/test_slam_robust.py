@@ -9,6 +9,7 @@ import pytest
 from box import box_pixels, inside_of_a_box
 
 from jaxpose import metrics, se3
+from jaxpose.camera import Camera
 from jaxpose.data.synthetic import RoomConfig, room
 from jaxpose.recording import Frame, Recording, select
 from jaxpose.slam.keyframes import look
@@ -166,6 +167,31 @@ def test_dropped_frames_are_survived(walk):
     some = select(walk, np.union1d([0], kept))
     result = run(some, SlamConfig(imu="combined"))
     assert not result.lost.any() and metrics.ate(result.T_world_cam, some.T_world_cam).rmse < 0.02
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("exposed", [1.0, 0.6])
+def test_a_camera_before_a_floor_of_planks_does_not_settle_a_plank_away(exposed):
+    """One plane and nothing but colour to hold on to, which pulls from half a plank; images may darken."""
+    camera = Camera(146.0, 146.0, 79.5, 59.5, 160, 120)
+    T = np.tile(np.eye(4), (6, 1, 1))
+    T[:, 0, 3], T[:, 1, 3] = [0, 0.09, 0.18, 0.1, 0.02, 0.11], [0, 0.0, 0.03, 0.06, 0.02, -0.02]
+    stain = np.random.default_rng(0).uniform(0.2, 0.6, 100)
+
+    def read(i):
+        row, column = np.mgrid[:120, :160]
+        x, y = (2 * (column - 79.5) / 146 + T[i, 0, 3], 2 * (row - 59.5) / 146 + T[i, 1, 3])
+        plank = np.floor(x / 0.08).astype(int) + 50
+        grain = 0.1 * np.sin(2 * np.pi * y / 0.3 + plank) + 0.1 * np.sin(5 * y + 3 * plank)
+        grey = 255 * (stain[plank] + grain) * (exposed if i else 1)
+        noise = np.random.default_rng(i).normal(size=grey.shape)
+        return Frame(
+            np.repeat(grey[..., None], 3, -1).astype(np.uint8), (2 + 0.006 * noise).astype(np.float32)
+        )
+
+    result = run(Recording("planks", camera, np.arange(6) / 5, read, T), SlamConfig(voxel=0.03))
+    assert not result.lost.any()
+    assert np.linalg.norm(result.T_world_cam[:, :3, 3] - T[:, :3, 3], axis=1).max() < 0.02
 
 
 @pytest.mark.slow

@@ -71,9 +71,22 @@ def test_slopes_of_the_residuals_are_those_of_finite_differences():
                 se3.apply(se3.compose(T, se3.exp(xi)), pixels.direction_cam * pixels.depth[:, None])
             ).rgb
         )
-        scale = np.median(found.colour / (fixed(jnp.zeros(6)) - pixels.rgb))
+        expected = fixed(jnp.zeros(6))
+        gain = expected.sum(0) / pixels.rgb.sum(0)
+        scale = np.median(found.colour / (expected - gain[None] * pixels.rgb))
         slope = scale * np.stack([(fixed(h) - fixed(-h)) / 2e-6 for h in steps], -1)
         np.testing.assert_allclose(by.colour, slope, rtol=1e-5, atol=1e-4)
+
+
+def test_an_image_that_is_darker_and_bluer_is_aligned_to_the_same_pose():
+    truth = np.asarray(se3.exp(jnp.array([0.1, -0.2, 0.3, 0.2, 0.1, -0.1])))
+    pixels, wide = box_pixels(truth, 300), jnp.array([0.5, 0.5])
+    start = se3.compose(jnp.asarray(truth), se3.exp(jnp.array([0.02, -0.01, 0.02, 0.01, -0.01, 0.02])))
+    aligned = jax.jit(lambda pixels: align(one_wall, start, start, wide, pixels, TrackConfig()))
+    bright = aligned(pixels)
+    dark = aligned(pixels._replace(rgb=pixels.rgb * jnp.array([[0.5, 0.6, 0.8]])))
+    assert dark.residuals.colour_error < 1.1 * bright.residuals.colour_error + 1e-3
+    assert jnp.linalg.norm(se3.log(se3.compose(se3.inverse(bright.T_world_cam), dark.T_world_cam))) < 2e-3
 
 
 def test_colour_finds_what_a_single_wall_does_not_say():

@@ -9,11 +9,11 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxpose import se3
 from jaxpose.slam.fuse import Lookup
-from jaxpose.slam.objective import Residuals, TrackConfig, image_loss, median
+from jaxpose.slam.objective import LEAST_SPREAD, Residuals, TrackConfig, image_loss, median
 from jaxpose.slam.observe import Pixels, back_project, depth_sigma
 
 _SETTLED = 2e-4  # [m, rad] a step this small ends the alignment
@@ -21,6 +21,7 @@ _INDEPENDENT = 100.0  # pixels
 _LONGEST = 0.2  # [m, rad] no step is longer
 _FLAT = 0.05  # a distance that changes less along a metre says nothing about the surface
 _DAMPING = 1e-4
+_BRIGHTER = 4.0  # times, at most, that one image is exposed longer than another
 
 
 class Alignment(NamedTuple):
@@ -83,12 +84,15 @@ def surface_residuals(
     away = jnp.abs(distance)
     inlier = known & (away < jnp.maximum(config.sample.band, 3 * median(away, known)))
     sigma = depth_sigma(pixels.depth)
-    colour = near.rgb - pixels.rgb
     coloured = inlier & (away < config.sample.band)
-    spread = jnp.maximum(median(jnp.mean(jnp.abs(colour), axis=-1), coloured), 0.01)
+    gain = exposure(near.rgb, pixels.rgb, coloured)
+    colour = near.rgb - gain[None] * pixels.rgb
+    colour_error = median(jnp.mean(jnp.abs(colour), axis=-1), coloured)
+    spread = jnp.maximum(colour_error, LEAST_SPREAD)
     colour = jnp.where(coloured[:, None], colour / spread, 0)
     share = jnp.sum(inlier) / jnp.maximum(jnp.sum(pixels.depth > 0), 1)
-    found = Residuals(distance / sigma, colour, inlier.astype(distance.dtype), median(away, inlier), share)
+    weight, depth_error = inlier.astype(distance.dtype), median(away, inlier)
+    found = Residuals(distance / sigma, colour, weight, depth_error, colour_error, gain, share)
 
     def by_pose(change):
         """From derivatives (n, 3) by the point in the world."""
@@ -99,6 +103,18 @@ def surface_residuals(
     by_colour = jnp.where(coloured[:, None, None], along.rgb / spread, 0)
     d_colour = jnp.stack([by_pose(by_colour[:, :, k]) for k in range(3)], axis=1)
     return found, Slopes(by_pose(along.distance / (steep * sigma)[:, None]), d_colour)
+
+
+def exposure(
+    map_rgb: Float[Array, "n 3"], rgb: Float[Array, "n 3"], counts: Bool[Array, " n"]
+) -> Float[Array, "3"]:
+    """What an image's colours are to be multiplied by to be as bright as the map's, without gradient.
+
+    The ratio of their sums: of a product's least squares, noise and a wrong pose would make less.
+    """
+    total = lambda colour: jnp.sum(jnp.where(counts[:, None], jax.lax.stop_gradient(colour), 0), axis=0)
+    ratio = total(map_rgb) / jnp.maximum(total(rgb), 1e-6)
+    return jnp.clip(ratio, 1 / _BRIGHTER, _BRIGHTER)
 
 
 def align(
@@ -146,8 +162,9 @@ def align(
         return (at.iterations < config.iterations) & (length > _SETTLED)
 
     count = pixels.depth.shape[0]
+    zero = jnp.zeros(())
     nothing = Residuals(
-        jnp.zeros(count), jnp.zeros((count, 3)), jnp.zeros(count), jnp.zeros(()), jnp.zeros(())
+        jnp.zeros(count), jnp.zeros((count, 3)), jnp.zeros(count), zero, zero, jnp.ones(3), zero
     )
     start = Alignment(T_world_cam, jnp.zeros((6, 6)), jnp.zeros(()), nothing, jnp.int32(0))
     return jax.lax.while_loop(unsettled, improve, (start, jnp.inf))[0]

@@ -39,6 +39,9 @@ _FOUND_AGAIN = 0.5, 1.3
 _RECKONED = 0.3  # [m, rad] a pose from the IMU alone is good enough to go on from
 _SHARP = 0.02  # [m, rad] a pose known less well is uncertain
 _LEAST_DEPTH = 0.01  # share of an image
+_PULLED = 0.03  # [m, rad] as far off as colour still pulls
+_WORSE_COLOUR, _BETTER_COLOUR = 1.5, 0.9  # against the usual error, and that of another pose
+_AS_MUCH, _AS_WELL = 0.7, 1.3  # share explained and loss against another pose's
 _FADING_S = 0.5  # in which a speed that nothing senses is forgotten
 
 
@@ -65,17 +68,16 @@ def next_pose(
     reach = _reach(system, state, ahead)
     if np.mean(frame.depth > 0) < _LEAST_DEPTH:
         return _moved(system, state, state.frames, ahead, None, lost=True)
-    frames, expected, tracked, lost = state.frames, ahead, None, True
-    for wide, try_key in zip((False, True), jax.random.split(key), strict=True):
-        if wide:
-            frames, found = _searched(system, state, frame, image, ahead.T_ref_body[-1], reach, try_key)
-            expected = _straight(ahead, found)
-        interval = _interval(system, frames, state.done - 1, expected)
-        tracked = _track(system, state, frames, interval, image, generator, try_key)
-        lost = _failed(system, state, tracked, reach)
-        if not lost:
-            break
-    assert tracked is not None
+    near_key, wide_key = jax.random.split(key)
+    frames = state.frames
+    tracked = _track(system, state, frames, ahead, image, generator, near_key)
+    lost = _failed(system, state, tracked, reach)
+    if lost or _doubtful(state, tracked, ahead):
+        bent, found = _searched(system, state, frame, image, ahead.T_ref_body[-1], reach, wide_key)
+        other = _track(system, state, bent, _straight(ahead, found), image, generator, wide_key)
+        other_lost = _failed(system, state, other, reach)
+        if lost or (not other_lost and _looks_better(other, tracked)):
+            frames, tracked, lost = bent, other, other_lost
     unknown_place = lost and tracked.valid < config.track.minimum_valid
     if unknown_place and config.senses_speed and max(reach) < _RECKONED:
         return _moved(system, state, state.frames, ahead, None, lost=False)
@@ -134,9 +136,12 @@ def _moved(
             iterations=tracked.iterations,
             loss=tracked.loss,
             depth_error=tracked.depth_error,
+            colour_error=tracked.colour_error,
             valid=tracked.valid,
             sigma=tracked.sigma,
         )
+    if tracked is not None and not lost:
+        state = state._replace(exposure=tracked.exposure)
     fade = np.exp(-dt / _FADING_S) if lost else 1.0
     velocity_body = end_velocity(dt, T_ref_body, ahead.readings, speed=config.senses_speed)
     return state._replace(
@@ -258,11 +263,12 @@ def _track(
     system: System,
     state: SlamState,
     frames: Frames,
-    interval: Interval,
+    ahead: Ahead,
     image: Image,
     generator: np.random.Generator,
     key: PRNGKeyArray,
 ) -> Tracked:
+    interval = _interval(system, frames, state.done - 1, ahead)
     config, t, last = system.config, system.recording.t, state.done - 1
     T_world_ref, T_world_first = frames.T_world_body[last], frames.T_world_body[0]
     where = gauge(config.frame, float(t[last] - t[0]), T_world_ref, T_world_first, generator)
@@ -279,9 +285,7 @@ def _failed(system: System, state: SlamState, tracked: Tracked, reach: np.ndarra
 
     After a loss more is asked for: a wrong place may look right, and would be mapped.
     """
-    frames, i = state.frames, state.done
-    losses = frames.loss[:i][~frames.lost[:i] & np.isfinite(frames.loss[:i])][-30:]
-    usual = float(np.median(losses)) if len(losses) else np.inf
+    frames, i, usual = state.frames, state.done, _usual(state, state.frames.loss)
     least, most = system.config.track.minimum_valid, 2.0
     held = system.config.senses_speed and max(reach) < _HELD
     if frames.lost[max(i - 2, 0) : i].any() and not held:
@@ -290,3 +294,28 @@ def _failed(system: System, state: SlamState, tracked: Tracked, reach: np.ndarra
     explained = finite and tracked.valid >= least
     # One sigma is what the sensor's own noise leaves; without noise the usual loss would be next to nothing.
     return not (explained and tracked.loss < most * max(usual, 1.0))
+
+
+def _doubtful(state: SlamState, tracked: Tracked, ahead: Ahead) -> bool:
+    """Whether the camera may have settled beside its place: colours fit worse than usual, or none is known.
+
+    Where there are few shapes, surfaces fit in more places than one, and colour pulls from a few cm only.
+    """
+    if state.done == 1:
+        return float(ahead.sigma.max()) > _PULLED
+    return float(tracked.colour_error) > _WORSE_COLOUR * _usual(state, state.frames.colour_error)
+
+
+def _looks_better(other: Tracked, tracked: Tracked) -> bool:
+    """Whether, of two poses that fit the surfaces, the other has the better colours and sees enough."""
+    return bool(
+        other.colour_error < _BETTER_COLOUR * tracked.colour_error
+        and other.valid > _AS_MUCH * tracked.valid
+        and other.loss < _AS_WELL * tracked.loss
+    )
+
+
+def _usual(state: SlamState, values: Float[np.ndarray, " n"]) -> float:
+    """The median over the last 30 frames that were found; infinite before the first."""
+    found = values[: state.done][~state.frames.lost[: state.done] & np.isfinite(values[: state.done])][-30:]
+    return float(np.median(found)) if len(found) else np.inf

@@ -40,6 +40,9 @@ class TrackConfig:
     sample: SampleConfig = SampleConfig()
 
 
+LEAST_SPREAD = 0.01  # of colours in [0, 1]
+
+
 class ImuWeights(NamedTuple):
     """Weights of the three inertial losses (METHOD section 5, point 4); 0 leaves one out."""
 
@@ -55,6 +58,8 @@ class Residuals(NamedTuple):
     colour: Float[Array, "n 3"]
     inlier: Float[Array, " n"]  # 1 or 0, without gradient
     depth_error: Float[Array, ""]  # [m] median over explained pixels
+    colour_error: Float[Array, ""]  # median over pixels that count, of colours in [0, 1]
+    exposure: Float[Array, "3"]  # what the colours were multiplied by to be as bright as the map's
     valid: Float[Array, ""]  # share of the pixels with depth that the map explains
 
 
@@ -75,10 +80,12 @@ def image_residuals(
     # However well the others fit, three sigmas are no outlier.
     inlier = valid & (jnp.abs(depth) < jnp.maximum(10 * median(jnp.abs(depth), valid), 3))
     colour = seen.rgb - pixels.rgb
-    spread = jnp.maximum(median(jnp.mean(jnp.abs(colour), axis=-1), inlier), 0.01)
+    colour_error = median(jnp.mean(jnp.abs(colour), axis=-1), inlier)
+    spread = jnp.maximum(colour_error, LEAST_SPREAD)
     share = jnp.sum(valid) / jnp.maximum(jnp.sum(pixels.depth > 0), 1)
     weight = jax.lax.stop_gradient(inlier.astype(depth.dtype))
-    return Residuals(depth, colour / spread, weight, median(jnp.abs(error), valid), share)
+    depth_error = median(jnp.abs(error), valid)
+    return Residuals(depth, colour / spread, weight, depth_error, colour_error, jnp.ones(3), share)
 
 
 def image_loss(residuals: Residuals, config: TrackConfig) -> Float[Array, ""]:

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt8
 
 from jaxpose import render, se3
@@ -15,10 +16,14 @@ from jaxpose.render import Query, Ray, Rendered
 
 
 class Image(NamedTuple):
-    """One RGB-D image on the device; depth along the optical axis [m], 0 where there is none."""
+    """One RGB-D image on the device; depth along the optical axis [m], 0 where there is none.
+
+    Colours times `exposure` are as bright as the map's.
+    """
 
     rgb: UInt8[Array, "h w 3"]
     depth: Float[Array, "h w"]
+    exposure: Float[Array, "3"] | np.ndarray = np.ones(3, np.float32)
 
 
 def to_device(frame: Frame) -> Image:
@@ -27,7 +32,7 @@ def to_device(frame: Frame) -> Image:
 
 
 class Pixels(NamedTuple):
-    """Pixels of an image: rays in camera axes (z = 1), measured depth [m] (0: none) and colour in [0, 1]."""
+    """Pixels of an image: rays in camera axes (z = 1), measured depth [m] (0: none), colour (1: white)."""
 
     direction_cam: Float[Array, "n 3"]
     depth: Float[Array, " n"]
@@ -67,7 +72,7 @@ def read_pixels(image: Image, camera: Camera, row: Int[Array, " n"], column: Int
     """The named pixels of an image."""
     pixel = jnp.stack([column, row], axis=-1).astype(jnp.float32)
     rgb = image.rgb[row, column].astype(jnp.float32) / 255
-    return Pixels(pixel_direction(camera, pixel), image.depth[row, column], rgb)
+    return Pixels(pixel_direction(camera, pixel), image.depth[row, column], rgb * image.exposure[None])
 
 
 def sample_depths(depth: Float[Array, ""], far: Float[Array, ""], config: SampleConfig) -> Float[Array, " s"]:

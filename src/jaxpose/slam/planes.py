@@ -24,7 +24,7 @@ class Seen(NamedTuple):
     normal: Float[Array, "*n 3"]
     offset: Float[Array, "*n"]
     worth: Float[Array, "*n"]
-    rgb: Float[Array, "*n 3"]  # in [0, 1]
+    rgb: Float[Array, "*n 3"]  # as bright as the map's
 
     def distance(self, point_cam: Float[Array, "*n 3"]) -> Float[Array, "*n"]:
         """Signed distance [m] of points in camera axes to the planes, positive in front of them."""
@@ -41,7 +41,8 @@ def seen_by(image: Image, camera: Camera) -> Callable[[Located], Seen]:
     cosine = _cosine(planes[..., :3], _directions(camera))
     near = (depth_sigma(jnp.ones(())) / depth_sigma(image.depth)) ** 2
     worth = jnp.where(image.depth > 0, near * jnp.maximum(cosine, GRAZING), 0)
-    rows = jnp.concatenate([planes, worth[..., None], image.rgb.astype(planes.dtype) / 255], axis=-1)
+    rgb = image.rgb.astype(planes.dtype) / 255 * image.exposure[None, None]
+    rows = jnp.concatenate([planes, worth[..., None], rgb], axis=-1)
 
     def at(located: Located) -> Seen:
         row = rows[located.row, located.column]

@@ -50,6 +50,7 @@ class SlamResult(NamedTuple):
     iterations: np.ndarray  # (n,)
     loss: np.ndarray  # (n,)
     depth_error: np.ndarray  # (n,) [m] median
+    colour_error: np.ndarray  # (n,) median, of colours in [0, 1]
     valid: np.ndarray  # (n,)
     sigma: np.ndarray  # (n, 2) [m, rad] of the pose, by what the image says of it
     seconds: np.ndarray  # (n,) wall time, compilation included
@@ -102,7 +103,8 @@ def begin(system: System, size: GridConfig | None = None) -> SlamState:
     key, field_key = jax.random.split(jax.random.key(config.seed))
     return SlamState(
         0, frames, np.zeros(6), np.zeros(3), np.zeros(3), GYRO_BIAS_SIGMA, np.zeros(3),
-        system.framed.field.init(field_key), key, 0.0, size, system.world(size).start(),
+        system.framed.field.init(field_key), key, np.ones(3, np.float32), 0.0, size,
+        system.world(size).start(),
     )  # fmt: skip
 
 
@@ -111,7 +113,7 @@ def step(system: System, state: SlamState, frame: Frame) -> SlamState:
     recording, config, i = system.recording, system.config, state.done
     generator = np.random.default_rng([config.seed, i])
     key, track_key, map_key = jax.random.split(state.key, 3)
-    image = to_device(frame)
+    image = to_device(frame)._replace(exposure=state.exposure)
     if i > 0:
         state = next_pose(system, state, frame, image, generator, track_key)
     if system.refit is not None and due(i, len(recording.t)):
@@ -124,6 +126,7 @@ def step(system: System, state: SlamState, frame: Frame) -> SlamState:
     away = np.linalg.norm(points - T_world_cam[:3, 3], axis=1)
     state = state._replace(far=max(state.far, 1.2 * float(np.percentile(away, 99))))
     state = room_for(points, state)
+    image = image._replace(exposure=state.exposure)
     return map_frame(system.world(state.grid), recording, config, state, image, points, generator, map_key)
 
 
@@ -193,6 +196,7 @@ def _finish(system: System, state: SlamState) -> SlamResult:
         iterations=frames.iterations,
         loss=frames.loss,
         depth_error=frames.depth_error,
+        colour_error=frames.colour_error,
         valid=frames.valid,
         sigma=frames.sigma,
         seconds=frames.seconds,

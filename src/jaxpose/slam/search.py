@@ -46,14 +46,14 @@ def search(
         spread, key = at
         centres = jnp.concatenate([best] * (_CANDIDATES // CENTRES))
         xi = jax.random.normal(key, (centres.shape[0], 6)) * spread * axes[None]
+        xi = xi.at[:CENTRES].set(0)  # the first round judges what it starts from
         tries = se3.compose(centres, se3.exp(xi))
         tried = jax.lax.map(score, tries, batch_size=64)
         return _best(jnp.concatenate([best, tries]), jnp.concatenate([scores, tried])), None
 
-    first = T_world_cam
     keys = jax.random.split(key, _ROUNDS)
     spreads = jnp.asarray([_NARROWER**k for k in range(_ROUNDS)], axes.dtype)
-    start = first, jax.lax.map(score, first, batch_size=CENTRES)
+    start = T_world_cam, jnp.full(CENTRES, jnp.inf, axes.dtype)
     (best, _), _ = jax.lax.scan(improve, start, (spreads, keys))
     return best[0]
 

@@ -22,6 +22,7 @@ class Frames(NamedTuple):
     iterations: Int[np.ndarray, " n"]
     loss: Float[np.ndarray, " n"]
     depth_error: Float[np.ndarray, " n"]  # [m] median
+    colour_error: Float[np.ndarray, " n"]  # median, of colours in [0, 1]
     valid: Float[np.ndarray, " n"]
     sigma: Float[np.ndarray, "n 2"]  # [m, rad] of the pose, by what the image says of it
     seconds: Float[np.ndarray, " n"]  # wall time, compilation included
@@ -46,6 +47,7 @@ class SlamState(NamedTuple):
     false_acceleration: Float[np.ndarray, "3"]  # [m/s^2] in the world (`predict.observe_acceleration`)
     params: Params  # of the tracked field
     key: PRNGKeyArray
+    exposure: Float[np.ndarray, "3"]  # of the last image that was tracked (`observe.Image`)
     far: float  # [m] how deep the map is
     grid: GridConfig
     map: MapState
@@ -64,6 +66,7 @@ def no_frames(count: int) -> Frames:
         iterations=np.zeros(count, int),
         loss=unknown,
         depth_error=unknown,
+        colour_error=unknown,
         valid=unknown,
         sigma=np.full((count, 2), np.nan),
         seconds=unknown,

@@ -38,6 +38,8 @@ class Tracked(NamedTuple):
     T_ref_body: Float[Array, "4 4"]
     loss: Float[Array, ""]  # of the image, in sigmas
     depth_error: Float[Array, ""]  # [m] median over valid pixels
+    colour_error: Float[Array, ""]  # median, of colours in [0, 1]
+    exposure: Float[Array, "3"]  # what its colours are to be multiplied by, to be as bright as the map's
     valid: Float[Array, ""]  # share of pixels with depth that the map explains
     iterations: Int[Array, ""]
     sigma: Float[Array, "2"]  # [m, rad] of the pose, by what the image says of it; NaN: not known
@@ -128,6 +130,8 @@ def make_track(
         seen = (
             found.loss,
             found.residuals.depth_error,
+            found.residuals.colour_error,
+            image.exposure * found.residuals.exposure,
             found.residuals.valid,
             found.iterations,
             pose_sigma(found),
@@ -151,13 +155,15 @@ def make_track(
             T_world_cam = se3.compose(T_world_ref, se3.compose(T_ref_body, T_body_cam))
             found = image_residuals(query, T_world_cam, pixels, far, config)
             total = image_loss(found, config)
-            seen = jnp.stack([total, found.depth_error, found.valid])
+            seen = jnp.stack([total, found.depth_error, found.colour_error, found.valid])
             return total + settle.beside(params, gauge, interval), seen
 
-        (params, seen), i = _descend(loss, params, config, config.iterations, config.patience)
-        image, error, valid = seen
-        unknown = jnp.full(2, jnp.nan)
-        return Tracked(params, settle.motion(params, gauge)(interval.t), image, error, valid, i, unknown)
+        (params, (total, depth_error, colour_error, valid)), i = _descend(
+            loss, params, config, config.iterations, config.patience
+        )
+        T_ref_body, unknown = settle.motion(params, gauge)(interval.t), jnp.full(2, jnp.nan)
+        exposure = jnp.asarray(image.exposure)
+        return Tracked(params, T_ref_body, total, depth_error, colour_error, exposure, valid, i, unknown)
 
     return gauss_newton if config.method == "gauss_newton" else gradient
 

@@ -112,6 +112,7 @@ def map_frame(
     if config.map.method == "fused":
         updated = world.update(state.map, image, jnp.asarray(T_world_cam[i], jnp.float32))
     else:
+        image = image._replace(exposure=np.ones(3, np.float32))  # as that of keyframes
         images, poses = [image] * config.map.window, [T_world_cam[i]] * config.map.window
         if len(kept):
             others = kept[choose(shares, config.map.window - 1, generator)]
