@@ -1,10 +1,15 @@
 """Fixtures: both precisions, strict dtypes, the data folder."""
 
 import os
+import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
-os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "false"  # nothing of another run, nothing left for the next
+if "PYTEST_XDIST_WORKER" not in os.environ:
+    # What is compiled is shared by workers and the commands they start; nothing is left for the next run.
+    _compiled = tempfile.TemporaryDirectory(prefix="jaxpose-compiled-")
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = _compiled.name
+    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = os.environ.get("CT", "0.3")
 
 import jax
 import jax.numpy as jnp

@@ -120,6 +120,7 @@ def test_report_states_numbers_with_their_protocol(finished):
     assert f"0 of {FRAMES} frames" in text
 
 
+@pytest.mark.slow
 def test_rgbd_slam_on_a_folder(folder, tmp_path, capsys):
     out = tmp_path / "run"
     rgbd_slam.main(
@@ -150,7 +151,7 @@ def test_compare_runs_every_mode(finished, tmp_path, monkeypatch, recording):
         poses = io.read_tum(finished.folder / "trajectory.txt").T
         return slam_run.SlamResult(
             poses, np.full_like(poses, np.nan), *np.zeros((2, FRAMES), bool), np.ones(FRAMES, bool),
-            np.ones(FRAMES, int), *np.ones((3, FRAMES)), np.ones((FRAMES, 2)), np.ones(FRAMES),
+            np.ones(FRAMES, int), *np.ones((4, FRAMES)), np.ones((FRAMES, 2)), np.ones(FRAMES),
             None, None, (np.zeros(1),) * 2,
             np.zeros(0, int), field, params, 0.0, 0.0,
         )  # fmt: skip

@@ -170,6 +170,7 @@ def test_settings_that_mean_nothing_are_refused():
             EventTrainConfig(**settings)
 
 
+@pytest.mark.slow
 def test_a_posenet_and_a_radiance_field_train_on_events_without_a_nan(seen):
     _, depths, data, background = seen
     config = EventTrainConfig(steps=4, events=16, samples=8, chunk=8, background=background)

@@ -255,6 +255,7 @@ def numbers(folder):
     return [{key: value for key, value in motion.items() if key != "seconds"} for motion in motions]
 
 
+@pytest.mark.slow
 def test_a_killed_run_resumed_has_the_numbers_of_a_whole_one(photograph, tmp_path, capsys):
     smoke = dict(image=photograph, smoke=True, pose="spline_reset")
     whole = planar.run(planar.Config(out=tmp_path / "whole", **smoke))

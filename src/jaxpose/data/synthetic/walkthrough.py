@@ -55,7 +55,7 @@ def room(config: RoomConfig = RoomConfig()) -> Recording:
     `config.along` it is a recorded motion with its readings (`drive.recorded`), the room as large as needed.
     """
     drive = _drive(config)
-    shapes, atlas = _scenery(config.seed, drive.room)
+    shapes, atlas = scenery(config.seed, drive.room)
     focal = 585 / 640 * config.width  # Kinect's angle of view
     centre = (config.width - 1) / 2, (config.height - 1) / 2
     camera = Camera(focal, focal, *centre, config.width, config.height)
@@ -79,7 +79,7 @@ def room(config: RoomConfig = RoomConfig()) -> Recording:
 
 
 @lru_cache(maxsize=2)
-def _scenery(seed: int, size: Extent) -> tuple[Shapes, Atlas]:
+def scenery(seed: int, size: Extent) -> tuple[Shapes, Atlas]:
     """What stands in a room of this size, with paint and light: seconds of work, the same for every walk."""
     palette, brush, _ = np.random.default_rng(seed).spawn(3)
     pieces, shapes = gather(furnish(palette, size))
