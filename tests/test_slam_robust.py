@@ -13,10 +13,11 @@ from jaxpose.camera import Camera
 from jaxpose.data.synthetic import RoomConfig, room
 from jaxpose.recording import Frame, Recording, select
 from jaxpose.slam.keyframes import look
-from jaxpose.slam.localise import _bent
+from jaxpose.slam.localise import _bent, _looks_better, _usual
 from jaxpose.slam.run import SlamConfig, run
 from jaxpose.slam.search import CENTRES, search
 from jaxpose.slam.state import no_frames
+from jaxpose.slam.track import Tracked
 
 BAND = 0.3
 
@@ -67,6 +68,25 @@ def test_lost_frames_lead_to_where_the_camera_is_found():
         expected = np.asarray(se3.exp(share * jnp.array([0.4, 0.0, 0.0, 0.0, 0.0, 0.8])))
         np.testing.assert_allclose(bent.T_world_body[i], expected, atol=1e-6)
     assert np.all(frames.T_world_body == np.eye(4))  # what was given is as it was
+
+
+def test_of_two_poses_that_fit_the_surfaces_colour_decides():
+    found = Tracked(
+        {}, *np.ones(3), colour_error=0.1, exposure=np.ones(3), valid=0.9, iterations=5, sigma=0.0
+    )
+    better = found._replace(colour_error=0.03)
+    assert _looks_better(better, found) and not _looks_better(found, better)
+    assert not _looks_better(found._replace(colour_error=0.099), found)  # no matter
+    assert not _looks_better(better._replace(valid=0.3), found)  # little in view, which may fit by chance
+    assert not _looks_better(better._replace(loss=2.0), found)  # the surfaces go first
+
+
+def test_what_is_usual_is_that_of_the_last_frames_found():
+    loss, lost = np.arange(50.0), np.isin(np.arange(50), range(40, 45))
+    loss[0], loss[lost] = np.nan, 1e3  # the first frame is not tracked
+    usual = lambda i: _usual(loss[:i], lost[:i])
+    assert usual(1) == np.inf and usual(2) == 1 and usual(31) == 15.5
+    assert usual(46) == np.median([*range(11, 40), 45])
 
 
 def test_a_frame_looks_like_itself_in_another_light():

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import Bool, Float, PRNGKeyArray
 
 from jaxpose import se3
 from jaxpose.metrics import nearest_rotation, rotation_angle_deg
@@ -285,7 +285,8 @@ def _failed(system: System, state: SlamState, tracked: Tracked, reach: np.ndarra
 
     After a loss more is asked for: a wrong place may look right, and would be mapped.
     """
-    frames, i, usual = state.frames, state.done, _usual(state, state.frames.loss)
+    frames, i = state.frames, state.done
+    usual = _usual(frames.loss[:i], frames.lost[:i])
     least, most = system.config.track.minimum_valid, 2.0
     held = system.config.senses_speed and max(reach) < _HELD
     if frames.lost[max(i - 2, 0) : i].any() and not held:
@@ -301,9 +302,10 @@ def _doubtful(state: SlamState, tracked: Tracked, ahead: Ahead) -> bool:
 
     Where there are few shapes, surfaces fit in more places than one, and colour pulls from a few cm only.
     """
-    if state.done == 1:
+    frames, i = state.frames, state.done
+    if i == 1:
         return float(ahead.sigma.max()) > _PULLED
-    return float(tracked.colour_error) > _WORSE_COLOUR * _usual(state, state.frames.colour_error)
+    return float(tracked.colour_error) > _WORSE_COLOUR * _usual(frames.colour_error[:i], frames.lost[:i])
 
 
 def _looks_better(other: Tracked, tracked: Tracked) -> bool:
@@ -315,7 +317,7 @@ def _looks_better(other: Tracked, tracked: Tracked) -> bool:
     )
 
 
-def _usual(state: SlamState, values: Float[np.ndarray, " n"]) -> float:
+def _usual(values: Float[np.ndarray, " i"], lost: Bool[np.ndarray, " i"]) -> float:
     """The median over the last 30 frames that were found; infinite before the first."""
-    found = values[: state.done][~state.frames.lost[: state.done] & np.isfinite(values[: state.done])][-30:]
+    found = values[~lost & np.isfinite(values)][-30:]
     return float(np.median(found)) if len(found) else np.inf
