@@ -158,7 +158,7 @@ def _times_and_poses(
     file = folder / "poses.txt"
     columns = _columns(file) if file.is_file() else 0
     if columns == 8:
-        trajectory = read_tum(file)
+        trajectory = read_tum(file, first_of_equal=t is not None)
         if t is None:
             _check_count(file, len(trajectory.t), count)
             return trajectory.t, trajectory.T
