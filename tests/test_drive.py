@@ -93,6 +93,7 @@ def test_readings_are_those_of_the_file_on_the_clock_of_the_frames(flown):
         )
 
 
+@pytest.mark.slow
 def test_a_filter_on_the_true_poses_takes_the_biases_off(flown):
     config = Config(room=RoomConfig(along=flown, duration_s=60.0, width=40, height=30), imu_filter=True)
     source = load(config)

@@ -65,6 +65,7 @@ def test_a_view_is_the_sum_along_every_ray():
     assert_allclose(depth, (weights * at).sum(-1), atol=1e-3)
 
 
+@pytest.mark.slow
 def test_noisy_poses_are_found_again():
     """The scene known, poses off by 0.1 and 6 degrees: PoseNet brings them back, on either side."""
     truth = np.asarray(around(T), np.float64)
