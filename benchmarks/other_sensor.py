@@ -16,7 +16,6 @@ import imageio.v3 as iio
 import numpy as np
 import tyro
 from scipy.ndimage import gaussian_filter
-from scipy.spatial.transform import Rotation, Slerp
 from tqdm import tqdm
 
 from jaxpose import io
@@ -24,6 +23,8 @@ from jaxpose.camera import Camera
 from jaxpose.data.synthetic import sensor
 from jaxpose.data.synthetic.furniture import SIZE
 from jaxpose.data.synthetic.walkthrough import render, scenery
+from jaxpose.imu_simulation import Interpolant, interpolant
+from jaxpose.metrics import rotation_angle_deg
 
 FOCAL = 585.0  # [px]
 DISPARITY = 580 * sensor.BASELINE  # [px m]
@@ -47,20 +48,11 @@ class Config:
     farthest: float = 4.5  # [m]
 
 
-def moved_to_the_room(trajectory: io.Trajectory):
-    """The pose at times since the first stamp, the motion's middle above that of the floor."""
-    t, T = trajectory.t - trajectory.t[0], trajectory.T
-    turn = Slerp(t, Rotation.from_matrix(T[:, :3, :3]))
-    middle = (T[:, :2, 3].min(axis=0) + T[:, :2, 3].max(axis=0)) / 2
-
-    def pose(seconds: float) -> np.ndarray:
-        found = np.eye(4)
-        found[:3, :3] = turn(seconds).as_matrix()
-        found[:3, 3] = [np.interp(seconds, t, axis) for axis in T[:, :3, 3].T]
-        found[:2, 3] -= middle
-        return found
-
-    return pose
+def moved_to_the_room(trajectory: io.Trajectory) -> Interpolant:
+    """The path over time since the first stamp, its middle above that of the floor."""
+    T = trajectory.T.copy()
+    T[:, :2, 3] -= (T[:, :2, 3].min(axis=0) + T[:, :2, 3].max(axis=0)) / 2
+    return interpolant(trajectory.t - trajectory.t[0], T)
 
 
 def measured(depth: np.ndarray, rng: np.random.Generator, config: Config) -> np.ndarray:
@@ -73,30 +65,35 @@ def measured(depth: np.ndarray, rng: np.random.Generator, config: Config) -> np.
 
 def main() -> None:
     config = tyro.cli(Config, description=__doc__)
-    trajectory = io.read_tum(config.trajectory, first_of_equal=True)
-    pose = moved_to_the_room(trajectory)
+    path = moved_to_the_room(io.read_tum(config.trajectory, first_of_equal=True))
     camera = Camera(FOCAL, FOCAL, 318.6, 241.3, 640, 480)
     shapes, atlas = scenery(config.seed, SIZE)
     seen = lambda T: [np.asarray(x) for x in render(camera, shapes, atlas, np.float32(T))]
     for kind in ("color", "depth"):
         (config.out / kind).mkdir(parents=True, exist_ok=True)
-    last = min(config.duration_s, trajectory.t[-1] - trajectory.t[0] - config.start_s - config.exposure_s)
+    last = min(config.duration_s, path.last - config.start_s - 2 * config.exposure_s)
     stamps = config.start_s + config.exposure_s + np.arange(int(last * config.rate_hz) + 1) / config.rate_hz
+    poses = path.pose(stamps)
     for i, t in enumerate(tqdm(stamps)):
-        _, depth, cosine = seen(pose(t))
-        open_at = t + config.exposure_s * np.linspace(-0.5, 0.5, 5)
-        colour = np.mean([seen(pose(s))[0].astype(np.float64) for s in open_at], axis=0)
+        _, depth, cosine = seen(poses[i])
+        while_open = path.pose(t + config.exposure_s * np.linspace(-0.5, 0.5, 5))
+        colour = np.mean([seen(T)[0].astype(np.float64) for T in while_open], axis=0)
         colour = np.roll(colour, config.shift, axis=(1, 0))
         colour = colour * np.exp(config.brighter * np.sin(2 * np.pi * t / 7.3))
         noise, holes = np.random.default_rng([config.seed, i]).spawn(2)
         found = np.where(sensor.holes(depth, cosine, camera, holes), 0, measured(depth, noise, config))
         iio.imwrite(config.out / f"color/{i:05d}.jpg", np.clip(colour, 0, 255).astype(np.uint8), quality=90)
         iio.imwrite(config.out / f"depth/{i:05d}.png", np.round(1000 * found).astype(np.uint16))
-    np.savetxt(config.out / "poses.txt", np.stack([pose(t) for t in stamps]).reshape(-1, 16))
+    np.savetxt(config.out / "poses.txt", poses.reshape(-1, 16))
     np.savetxt(config.out / "times.txt", stamps)
     pinhole = dict(zip(camera._fields[:6], camera[:6], strict=True))
     (config.out / "intrinsics.json").write_text(json.dumps({**pinhole, "depth_scale": 1000}))
-    print(f"wrote {len(stamps)} frames to {config.out}")
+    metres = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    degrees = rotation_angle_deg(poses[:-1, :3, :3], poses[1:, :3, :3])
+    print(
+        f"wrote {len(stamps)} frames to {config.out}; from one to the next {100 * np.median(metres):.1f} cm "
+        f"and {np.median(degrees):.1f} deg (medians)"
+    )
 
 
 if __name__ == "__main__":

@@ -19,9 +19,10 @@ from timing import in_turn, machine, milliseconds
 from jaxpose import se3
 from jaxpose.camera import Camera
 from jaxpose.fields import PoseNetConfig, posenet
+from jaxpose.recording import Frame
 from jaxpose.scenes import box, grid, node_positions
 from jaxpose.slam.objective import TrackConfig, image_loss, image_residuals
-from jaxpose.slam.observe import Image, SampleConfig, sample_pixels
+from jaxpose.slam.observe import SampleConfig, sample_pixels, to_device
 
 CAMERA = Camera(585.0, 585.0, 320.0, 240.0, 640, 480)
 FIELDS = {
@@ -53,8 +54,7 @@ def room() -> tuple:
     direction = np.stack([x, y, np.ones_like(x)], axis=-1)
     depth = (HALF / np.maximum(np.abs(direction), 1e-9)).min(axis=-1)
     rgb = (255 * colour(depth[..., None] * direction)).astype(np.uint8)
-    image = Image(jnp.asarray(rgb), jnp.asarray(depth, jnp.float32))
-    return grid(config), (jnp.asarray(values, jnp.float32),), image
+    return grid(config), (jnp.asarray(values, jnp.float32),), to_device(Frame(rgb, depth))
 
 
 def colour(point: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxpose import se3
 from jaxpose.slam.fuse import Lookup
-from jaxpose.slam.objective import LEAST_SPREAD, Residuals, TrackConfig, image_loss, median
+from jaxpose.slam.objective import Residuals, TrackConfig, colour_spread, image_loss, median
 from jaxpose.slam.observe import Pixels, back_project, depth_sigma
 
 _SETTLED = 2e-4  # [m, rad] a step this small ends the alignment
@@ -87,8 +87,7 @@ def surface_residuals(
     coloured = inlier & (away < config.sample.band)
     gain = exposure(near.rgb, pixels.rgb, coloured)
     colour = near.rgb - gain[None] * pixels.rgb
-    colour_error = median(jnp.mean(jnp.abs(colour), axis=-1), coloured)
-    spread = jnp.maximum(colour_error, LEAST_SPREAD)
+    colour_error, spread = colour_spread(colour, coloured)
     colour = jnp.where(coloured[:, None], colour / spread, 0)
     share = jnp.sum(inlier) / jnp.maximum(jnp.sum(pixels.depth > 0), 1)
     weight, depth_error = inlier.astype(distance.dtype), median(away, inlier)

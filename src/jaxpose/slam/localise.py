@@ -113,9 +113,11 @@ def _moved(
     """The state after an interval: with the tracked motion, or with the predicted one where that is lost."""
     config, i, dt, predicted = system.config, state.done, ahead.dt, ahead.T_ref_body[-1]
     if tracked is None or lost:  # neither: reckoned from the IMU
-        frames, T_ref_body, params = state.frames, predicted, state.params
+        frames, T_ref_body = state.frames, predicted
+        params, exposure = state.params, state.exposure
     else:
-        T_ref_body, params = np.asarray(tracked.T_ref_body, np.float64), tracked.params
+        T_ref_body = np.asarray(tracked.T_ref_body, np.float64)
+        params, exposure = tracked.params, tracked.exposure
     T_world_ref = frames.T_world_body[i - 1]
     T_world_body = T_world_ref @ T_ref_body
     T_world_body[:3, :3] = nearest_rotation(T_world_body[:3, :3])  # float32 adds up
@@ -140,8 +142,6 @@ def _moved(
             valid=tracked.valid,
             sigma=tracked.sigma,
         )
-    if tracked is not None and not lost:
-        state = state._replace(exposure=tracked.exposure)
     fade = np.exp(-dt / _FADING_S) if lost else 1.0
     velocity_body = end_velocity(dt, T_ref_body, ahead.readings, speed=config.senses_speed)
     return state._replace(
@@ -152,6 +152,7 @@ def _moved(
         gyro_bias_sigma=gyro_bias_sigma,
         false_acceleration=false_acceleration,
         params=params,
+        exposure=exposure,
     )
 
 

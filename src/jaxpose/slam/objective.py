@@ -15,6 +15,8 @@ from jaxpose.render import Query
 from jaxpose.slam.observe import Pixels, SampleConfig, depth_sigma, render_pixels
 from jaxpose.slam.predict import Interval
 
+_LEAST_SPREAD = 0.01  # of colours in [0, 1]
+
 
 @dataclass(frozen=True)
 class TrackConfig:
@@ -38,9 +40,6 @@ class TrackConfig:
     dof_weight: float = 0.1  # of L_dof, in the frame intrinsic under `gradient`
     minimum_valid: float = 0.2  # share of the pixels the map must explain
     sample: SampleConfig = SampleConfig()
-
-
-LEAST_SPREAD = 0.01  # of colours in [0, 1]
 
 
 class ImuWeights(NamedTuple):
@@ -80,12 +79,19 @@ def image_residuals(
     # However well the others fit, three sigmas are no outlier.
     inlier = valid & (jnp.abs(depth) < jnp.maximum(10 * median(jnp.abs(depth), valid), 3))
     colour = seen.rgb - pixels.rgb
-    colour_error = median(jnp.mean(jnp.abs(colour), axis=-1), inlier)
-    spread = jnp.maximum(colour_error, LEAST_SPREAD)
+    colour_error, spread = colour_spread(colour, inlier)
     share = jnp.sum(valid) / jnp.maximum(jnp.sum(pixels.depth > 0), 1)
     weight = jax.lax.stop_gradient(inlier.astype(depth.dtype))
     depth_error = median(jnp.abs(error), valid)
     return Residuals(depth, colour / spread, weight, depth_error, colour_error, jnp.ones(3), share)
+
+
+def colour_spread(
+    colour: Float[Array, "n 3"], counts: Bool[Array, " n"]
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """The median size of residuals of colour over the pixels that count, and what they are divided by."""
+    error = median(jnp.mean(jnp.abs(colour), axis=-1), counts)
+    return error, jnp.maximum(error, _LEAST_SPREAD)
 
 
 def image_loss(residuals: Residuals, config: TrackConfig) -> Float[Array, ""]:

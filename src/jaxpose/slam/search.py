@@ -41,20 +41,17 @@ def search(
         away = se3.log(se3.compose(se3.inverse(T_world_cam), T[None])) / axes[None]
         return mismatch(look_up, T, pixels) + _PRIOR * jnp.min(jnp.sum(away**2, axis=-1))
 
-    def improve(carry, at):
-        best, scores = carry
+    def improve(best, at):
         spread, key = at
         centres = jnp.concatenate([best] * (_CANDIDATES // CENTRES))
         xi = jax.random.normal(key, (centres.shape[0], 6)) * spread * axes[None]
-        xi = xi.at[:CENTRES].set(0)  # the first round judges what it starts from
-        tries = se3.compose(centres, se3.exp(xi))
-        tried = jax.lax.map(score, tries, batch_size=64)
-        return _best(jnp.concatenate([best, tries]), jnp.concatenate([scores, tried])), None
+        tries = se3.compose(centres, se3.exp(xi.at[:CENTRES].set(0)))  # the best themselves, and around them
+        _, lowest = jax.lax.top_k(-jax.lax.map(score, tries, batch_size=64), CENTRES)
+        return tries[lowest], None
 
     keys = jax.random.split(key, _ROUNDS)
     spreads = jnp.asarray([_NARROWER**k for k in range(_ROUNDS)], axes.dtype)
-    start = T_world_cam, jnp.full(CENTRES, jnp.inf, axes.dtype)
-    (best, _), _ = jax.lax.scan(improve, start, (spreads, keys))
+    best, _ = jax.lax.scan(improve, T_world_cam, (spreads, keys))
     return best[0]
 
 
@@ -66,8 +63,3 @@ def mismatch(look_up: Lookup, T_world_cam: Float[Array, "4 4"], pixels: Pixels) 
     cost = jnp.where(near.known > 0, off + _COLOUR * jnp.minimum(colour, 1), 1 + _COLOUR)
     seen = (pixels.depth > 0).astype(cost.dtype)
     return jnp.sum(cost * seen) / jnp.maximum(jnp.sum(seen), 1)
-
-
-def _best(poses: Float[Array, "n 4 4"], scores: Float[Array, " n"]):
-    lowest, index = jax.lax.top_k(-scores, CENTRES)
-    return poses[index], -lowest
