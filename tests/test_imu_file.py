@@ -15,6 +15,7 @@ from jaxpose.errors import DataError
 from jaxpose.experiments.imu_slam import Config, main
 from jaxpose.experiments.slam_options import load
 from jaxpose.recording import Recording
+from jaxpose.slam.first_pose import first_pose
 
 T0_NS = 1_403_715_523_912_143_104  # of the first image, with ns that a float of seconds cannot hold
 PERIOD_NS = 5_000_000
@@ -169,6 +170,23 @@ def test_a_unit_and_a_mounting_that_disagree_with_gravity_are_told(desk, walk, f
     else:
         (note,) = notes
         assert re.search(found, note) and "check unit and extrinsics" in note
+
+
+def test_without_true_poses_the_readings_say_which_way_is_down(desk, walk):
+    (desk / "poses.txt").unlink()
+    force = np.tile(readings(walk)[1][0], (400, 1))
+    omega = np.zeros_like(force)
+    csv(desk / "imu.csv", times_ns(), omega, force)
+    recording = load(config(desk)).recording
+    assert recording.T_world_cam is None
+    assert "upright" in first_pose(recording).notes[0]
+    for factor, got in (1 / G, "got 1: check the units"), (0.0, "got 0: check"):
+        csv(desk / "imu.csv", times_ns(), omega, factor * force)
+        expected = (
+            r"expected readings around frame 0, which has no true pose, whose mean is gravity's 9.81 m/s\^2"
+        )
+        with pytest.raises(DataError, match=f"--imu combined {expected}, {got}"):
+            load(config(desk))
 
 
 def test_the_options_go_together_and_a_missing_file_is_one_line(desk):

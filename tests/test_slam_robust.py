@@ -142,6 +142,16 @@ def test_an_imu_bridges_two_seconds_of_darkness(walk):
     assert error.max() < 0.06 and metrics.ate(result.T_world_cam, truth).rmse < 0.03
 
 
+@pytest.mark.slow
+def test_without_true_poses_the_readings_find_their_gravity(walk):
+    truth = walk.T_world_cam
+    assert truth is not None
+    result = run(walk._replace(T_world_cam=None), SlamConfig(imu="combined"))
+    assert not result.lost.any() and metrics.ate(result.T_world_cam, truth).rmse < 0.02
+    up = (result.T_world_cam @ np.linalg.inv(truth))[:, :3, 2]
+    assert (np.rad2deg(np.arccos(up[:, 2])) < 3).all()
+
+
 def holes(frame, rng):
     return frame._replace(depth=np.where(rng.uniform(size=frame.depth.shape) < 0.7, 0, frame.depth))
 

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxpose.data import tum
 from jaxpose.errors import DataError
+from jaxpose.slam.first_pose import first_pose
 
 START = 1305031102.0  # seconds since 1970
 COLOR_T = START + np.array([0.0, 0.0332, 0.0681, 0.1003, 0.1340, 0.1675])
@@ -42,7 +43,6 @@ def desk(tmp_path, walk, save):
     t = np.stack([COLOR_T[kept] - 0.012, COLOR_T[kept] + 0.004], axis=1).ravel()
     T = np.stack([np.tile(np.eye(4), (5, 1, 1)), walk.T_world_cam[kept]], axis=1).reshape(-1, 4, 4)
     write_truth(folder / "groundtruth.txt", t[t != COLOR_T[5] - 0.012], T[t != COLOR_T[5] - 0.012])
-    (folder / "accelerometer.txt").write_text("# timestamp ax ay az\n1305031098.6 0.1 8.1 -4.0\n")
     return folder
 
 
@@ -64,14 +64,65 @@ def test_a_made_sequence_reads_back(desk, walk, metres):
     assert np.isnan(recording.T_world_cam[3]).all()
     np.testing.assert_allclose(recording.T_world_cam[[0, 1, 2, 4]], walk.T_world_cam[[0, 1, 3, 5]], atol=1e-9)
     assert recording.imu is None
-    color, depth, intrinsics, truth, accelerometer = recording.notes
+    assert recording.accelerometer is None
+    color, depth, intrinsics, truth = recording.notes
     assert color == (
         "1 of 6 colour images left out, no depth of their own within 0.02 s: 1305031102.068100.png"
     )
     assert depth.startswith("1 of 6 depth images left out") and "1305031102.089600.png" in depth
     assert intrinsics.endswith("which are for 640x480; the images are 32x24")
     assert truth == "1 frames without a usable pose (none within 0.02 s): 1305031102.134000"
-    assert "accelerometer.txt" in accelerometer
+
+
+KINECT = {
+    "left": [-1, 0, 0],
+    "up": [0, -1, 0],
+    "forward": [0, 0, 1],
+}  # the accelerometer's axes in the camera's
+
+
+def held(folder, T_world_cam, turned="left up forward"):
+    """Readings of a Kinect held still, as at the fourth image, from 2 s before the first on."""
+    up_cam = T_world_cam[3, 2, :3]
+    axes = [KINECT[name] for name in turned.split()]
+    t = np.arange(COLOR_T[0] - 2, COLOR_T[-1] + 2, 0.002)
+    rows = [f"{x:.6f} " + " ".join(f"{9.8 * up_cam @ axis:.6f}" for axis in axes) for x in t]
+    (folder / "accelerometer.txt").write_text(
+        "\n".join(["# accelerometer data", "# timestamp ax ay az", *rows])
+    )
+    return 9.8 * up_cam
+
+
+def test_the_accelerometer_is_read_in_the_camera_s_axes(desk, walk):
+    force = held(desk, walk.T_world_cam)
+    t, force_cam = tum.load(desk).accelerometer
+    np.testing.assert_allclose(force_cam, np.tile(force, (len(t), 1)), atol=1e-5)
+    np.testing.assert_allclose([t[0], t[1] - t[0]], [COLOR_T[0] - 2 - START, 0.002], atol=2e-6)
+    (desk / "groundtruth.txt").unlink()
+    found = first_pose(tum.load(desk))
+    assert "upright" in found.notes[0]
+    np.testing.assert_allclose(found.T_world_cam[2, :3], force / 9.8, atol=1e-6)
+
+
+def test_an_accelerometer_that_disagrees_with_the_truth_is_told(desk, walk):
+    upright = np.tile(walk.T_world_cam[3], (6, 1, 1))
+    write_truth(desk / "groundtruth.txt", COLOR_T, upright)
+    held(desk, walk.T_world_cam)
+    assert not any("accelerometer" in note for note in tum.load(desk).notes)
+    held(desk, walk.T_world_cam, "up left forward")
+    (note,) = (note for note in tum.load(desk).notes if "accelerometer" in note)
+    assert note.startswith("accelerometer.txt's mean force is 9.8 m/s^2, ") and "by the true poses" in note
+
+
+def test_an_accelerometer_without_readings_and_a_damaged_one(desk):
+    file = desk / "accelerometer.txt"
+    file.write_text("# accelerometer data\n# timestamp ax ay az\n")
+    recording = tum.load(desk)
+    assert recording.accelerometer is None and "accelerometer.txt has no readings" in recording.notes
+    file.write_text("# timestamp ax ay az\n1305031098.6 0.1 8.1 -4.0\n1305031098.7 0.1\n")
+    with pytest.raises(DataError) as error:
+        tum.load(desk)
+    assert str(error.value) == f"{file}:3: expected 4 numbers (t ax ay az), got 2"
 
 
 def test_the_limit_of_association_is_a_setting(desk):

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int, UInt8
 from jaxpose.camera import Camera
 from jaxpose.errors import DataError
 from jaxpose.events import Events, Mosaic
-from jaxpose.imu import Imu
+from jaxpose.imu import GRAVITY_WORLD, Imu
 
 
 class Frame(NamedTuple):
@@ -17,6 +17,13 @@ class Frame(NamedTuple):
 
     rgb: np.ndarray  # (height, width, 3) uint8
     depth: np.ndarray  # (height, width) float32
+
+
+class Accelerometer(NamedTuple):
+    """Readings of an accelerometer without a gyroscope: it tells which way is up, but is no IMU."""
+
+    t: Float[np.ndarray, " m"]  # [s]
+    force_cam: Float[np.ndarray, "m 3"]  # [m/s^2] specific force, gravity in it, in the camera's axes
 
 
 class Recording(NamedTuple):
@@ -29,10 +36,11 @@ class Recording(NamedTuple):
     T_world_cam: np.ndarray | None = None  # (n, 4, 4) truth, rows of NaN where it is missing
     imu: Imu | None = None  # on the clock of `t`
     T_body_cam: np.ndarray = np.eye(4)  # body = IMU
-    gravity_world: np.ndarray = np.array([0.0, 0.0, -9.80665])  # in the frame of `T_world_cam`
+    gravity_world: np.ndarray = np.array(GRAVITY_WORLD)  # in the frame of `T_world_cam`
     notes: tuple[str, ...] = ()  # what the loader has to tell the user
     files: tuple[str, ...] = ()  # each colour image, relative to the recording's folder; empty: on no disk
     t0: float = 0.0  # where `t` is 0 on the clock of the recording's files [s]
+    accelerometer: Accelerometer | None = None  # on the clock of `t`, of a recording without IMU
 
 
 class Photographs(NamedTuple):

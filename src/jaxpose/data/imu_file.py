@@ -6,13 +6,13 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxpose.data.euroc_files import IMU_COLUMNS, read_csv, read_extrinsics, seconds
+from jaxpose.data.gravity import gravity_note
 from jaxpose.errors import DataError
 from jaxpose.imu import Imu
 from jaxpose.io import orthonormal, read_numbers
 from jaxpose.recording import Recording
 
 _TEXT_COLUMNS = "7 numbers (t wx wy wz ax ay az)"
-_MOST_OFF_UP_DEG, _MOST_OFF_GRAVITY = 10.0, 0.1  # of the mean specific force, before it is told
 
 
 def read_imu(file: Path | str) -> Imu:
@@ -91,26 +91,7 @@ def imu_notes(recording: Recording, name: Path | str) -> tuple[str, ...]:
     if not inside.all():
         notes.append(f"the IMU covers {inside.sum()} of {len(t)} frames: {spans[1]} of {spans[0]}")
     if recording.T_world_cam is not None:
-        R = (recording.T_world_cam @ np.linalg.inv(recording.T_body_cam))[:, :3, :3]
-        usable = inside & np.isfinite(R).all(axis=(1, 2))
-        notes += _gravity(recording, R[usable], t[usable]) if usable.sum() > 1 else []
+        T_world_body = recording.T_world_cam @ np.linalg.inv(recording.T_body_cam)
+        force = np.asarray(recording.imu.acceleration_body)
+        notes += gravity_note(at, force, t, T_world_body, recording.gravity_world, "the IMU")
     return tuple(notes)
-
-
-def _gravity(
-    recording: Recording, R_world_body: Float[np.ndarray, "n 3 3"], t: Float[np.ndarray, " n"]
-) -> list[str]:
-    """A note if the mean specific force in the world is far from the opposite of gravity."""
-    assert recording.imu is not None
-    at, force_body = (np.asarray(x) for x in (recording.imu.t, recording.imu.acceleration_body))
-    force = np.stack([np.interp(t, at, axis) for axis in force_body.T], axis=-1)
-    mean = np.einsum("nij,nj->i", R_world_body, force) / len(t)  # what moves comes to rest: no acceleration
-    up = -recording.gravity_world
-    norm, gravity = np.linalg.norm(mean), np.linalg.norm(up)
-    off = np.degrees(np.arccos(np.clip(mean @ up / max(norm * gravity, 1e-12), -1, 1)))
-    if off <= _MOST_OFF_UP_DEG and abs(norm / gravity - 1) <= _MOST_OFF_GRAVITY:
-        return []
-    return [
-        f"the IMU's mean force is {norm:.3g} m/s^2, {off:.0f} deg from up by the true poses, "
-        f"where gravity is {gravity:.3g}: check unit and extrinsics, and that the truth's z axis points up"
-    ]

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxpose.camera import Camera
+from jaxpose.data.gravity import gravity_note
 from jaxpose.data.images import (
     INTRINSICS,
     Pinhole,
@@ -26,12 +27,14 @@ from jaxpose.data.images import (
     within,
 )
 from jaxpose.errors import DataError
-from jaxpose.io import nearest
+from jaxpose.imu import GRAVITY_WORLD
+from jaxpose.io import nearest, read_numbers
 from jaxpose.io_trajectory import read_trajectory
-from jaxpose.recording import Frame, Recording
+from jaxpose.recording import Accelerometer, Frame, Recording
 
 _SIZE = (640, 480)
 _NOMINAL = Pinhole(525.0, 525.0, 319.5, 239.5)
+_R_CAM_KINECT = np.diag([-1.0, -1.0, 1.0])
 # By the data set's three cameras: the colour camera's intrinsics, and k1 k2 p1 p2 k3 of its lens.
 _CAMERAS: dict[str, tuple[Pinhole, tuple[float, ...]]] = {
     "1": (Pinhole(517.3, 516.5, 318.6, 255.3), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
@@ -61,7 +64,9 @@ def load(path: Path | str, *, max_difference_s: float = 0.02, depth_per_metre: f
     with one stamp (the published fr2_desk has two) the first counts. Intrinsics (3x3) are read from
     `camera-intrinsics.txt` in or beside the folder; else they and the lens are the published ones of
     freiburg1, 2 or 3, by the folder's name. Depth is registered to colour and stored as `depth_per_metre`
-    counts. `accelerometer.txt` is not used. `notes` tells what was left out or assumed.
+    counts. `accelerometer.txt` (m/s^2) is the Kinect's own, whose axes are left, up and forward (Microsoft's
+    Kinect documentation, "Accelerometer"): without truth it says which way is up. `notes` tells what was left
+    out or assumed, and whether the accelerometer disagrees with the truth.
 
     DataError naming the file for anything that cannot be used; ValueError for a setting that is not positive.
     """
@@ -81,15 +86,15 @@ def load(path: Path | str, *, max_difference_s: float = 0.02, depth_per_metre: f
     poses, lacking = _truth(folder / "groundtruth.txt", stamps, max_difference_s)
     notes = [*_alone("colour", "depth", color, rows, max_difference_s)]
     notes += [*_alone("depth", "colour", depth, partners, max_difference_s), *assumed, *lacking]
-    if (folder / "accelerometer.txt").is_file():
-        notes.append("accelerometer.txt is not used: without a gyroscope it is no IMU")
+    accelerometer, weighed = _accelerometer(folder / "accelerometer.txt", stamps, poses)
     return Recording(
         name=name_of(folder),
         camera=Camera(*pinhole, *size, lens),
         t=stamps - stamps[0],
         read=lambda i: Frame(read_color(colors[i]), read_depth(depths[i], depth_per_metre)),
         T_world_cam=poses,
-        notes=tuple(notes),
+        accelerometer=accelerometer,
+        notes=(*notes, *weighed),
         t0=float(stamps[0]),
         files=within(colors, path),
     )
@@ -185,3 +190,21 @@ def _truth(
     if repeated:
         notes += (f"{repeated} lines of groundtruth.txt repeat the stamp before them and are ignored",)
     return checked, notes
+
+
+def _accelerometer(
+    file: Path, stamps: Float[np.ndarray, " n"], T_world_cam: Float[np.ndarray, "n 4 4"] | None
+) -> tuple[Accelerometer | None, tuple[str, ...]]:
+    """The readings on the frames' clock, in the camera's axes, and a note where the truth disagrees."""
+    if not file.is_file():
+        return None, ()
+    if all(line.startswith("#") or not line.strip() for line in file.read_text("utf-8-sig").splitlines()):
+        return None, ("accelerometer.txt has no readings",)
+    _, values = read_numbers(file, "4 numbers (t ax ay az)", (4,))
+    values = values[np.argsort(values[:, 0], kind="stable")]
+    t, force_cam = values[:, 0] - stamps[0], values[:, 1:] @ _R_CAM_KINECT.T
+    if T_world_cam is None:
+        return Accelerometer(t, force_cam), ()
+    gravity = np.array(GRAVITY_WORLD)
+    notes = gravity_note(t, force_cam, stamps - stamps[0], T_world_cam, gravity, "accelerometer.txt")
+    return Accelerometer(t, force_cam), notes

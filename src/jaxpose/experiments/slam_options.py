@@ -21,6 +21,7 @@ from jaxpose.imu import ADIS16448, QUIET, Imu, ImuNoise
 from jaxpose.imu_filter import filter_imu
 from jaxpose.imu_simulation import simulate_from_poses
 from jaxpose.recording import Recording, select, thin
+from jaxpose.slam.first_pose import first_force, is_gravity
 from jaxpose.slam.run import SlamConfig
 
 SIMULATED_HZ = 200.0  # of the IMU made for recordings that have none (METHOD section 5)
@@ -242,13 +243,19 @@ def _simulated(recording: Recording, options: Options) -> Imu:
 
 
 def _check_gravity(recording: Recording, options: Options) -> None:
-    """Refuse real readings where nothing says which way is down: the first frame used has no true pose."""
+    """Refuse real readings where nothing says which way is down: no true pose, and no gravity in them."""
     truth = recording.T_world_cam
-    if (options.compare or options.slam.imu != "none") and (truth is None or not np.isfinite(truth[0]).all()):
+    if options.slam.imu == "none" and not options.compare:
+        return
+    if truth is not None and np.isfinite(truth[0]).all():
+        return
+    force, gravity = first_force(recording), np.linalg.norm(recording.gravity_world)
+    if force is None or not is_gravity(force, recording.gravity_world):
         mode = "--compare" if options.compare else f"--imu {options.slam.imu}"
+        got = "none there" if force is None else f"{np.linalg.norm(force):.3g}: check the units"
         raise DataError(
-            f"{recording.name}: {mode} expected a true pose of frame {options.start}, which says where "
-            "gravity points, got none; --imu none goes without"
+            f"{recording.name}: {mode} expected readings around frame {options.start}, which has no true "
+            f"pose, whose mean is gravity's {gravity:.3g} m/s^2, got {got}; --imu none goes without"
         )
 
 
@@ -276,6 +283,7 @@ def _cut(recording: Recording, options: Options) -> Recording:
             f"from frame {options.start} at {options.rate_hz or options.recorded_hz:g} Hz"
         )
     first, imu, truth = recording.t[0], recording.imu, recording.T_world_cam
+    accelerometer = recording.accelerometer
     notes = recording.notes
     if truth is not None and np.isfinite(truth).all(axis=(1, 2)).sum() < FEWEST_FRAMES:
         truth, notes = (
@@ -285,6 +293,7 @@ def _cut(recording: Recording, options: Options) -> Recording:
     return recording._replace(
         t=recording.t - first,
         imu=None if imu is None else imu._replace(t=np.asarray(imu.t) - first),
+        accelerometer=None if accelerometer is None else accelerometer._replace(t=accelerometer.t - first),
         t0=recording.t0 + float(first),
         T_world_cam=truth,
         notes=notes,

@@ -27,6 +27,7 @@ from jaxpose.io_camera import write_camera
 from jaxpose.io_field import bspline_factor, write_field
 from jaxpose.io_ply import write_ply
 from jaxpose.recording import Recording
+from jaxpose.slam.first_pose import first_pose
 from jaxpose.slam.keyframes import read_keyframes
 from jaxpose.slam.run import ImuMode, Progress, SlamResult
 from jaxpose.slam.run import run as track
@@ -148,7 +149,7 @@ def _written(
     values, coat = jax.tree.map(np.asarray, result.scene_params)
     write_map(folder / "map.npz", SavedMap(result.grid, values, coat, result.keyframes))
     images_folder = "." if options.data is None else options.data.resolve()
-    notes = (*recording.notes, *_write_surface(folder, recording, result))
+    notes = (*recording.notes, *first_pose(recording).notes, *_write_surface(folder, recording, result))
     write_camera(folder / "camera.json", recording.camera, recording.files, images_folder)
     io.write_json(folder / "config.json", options)
     results = {

@@ -14,6 +14,7 @@ from jaxpose.fields import PoseField, bspline, control_points, fit, stamped
 from jaxpose.recording import Frame, Recording
 from jaxpose.scenes import GridConfig, SceneField
 from jaxpose.slam.config import ImuMode, SlamConfig
+from jaxpose.slam.first_pose import first_pose
 from jaxpose.slam.keyframes import read_keyframes
 from jaxpose.slam.localise import next_pose
 from jaxpose.slam.observe import to_device
@@ -72,10 +73,9 @@ def run(
 ) -> SlamResult:
     """Track every frame of an RGB-D recording and map what it sees (paper section 3.4, METHOD section 5).
 
-    The world's frame is that of the truth where its first pose is known (as in NICE-SLAM), else the first
-    camera's; `gravity_world` must be in that frame. `state` is where an earlier run stood, to go on from
-    there. Raises DataError where the recording cannot be tracked: fewer than two frames, no depth in the
-    first, IMU asked for and not there.
+    The world's frame is `first_pose`'s: that of the truth, or upright by an accelerometer; `gravity_world` is
+    in it. `state` is where an earlier run stood, to go on from there. Raises DataError where the recording
+    cannot be tracked: fewer than two frames, no depth in the first, IMU asked for and not there.
     """
     system = make_system(recording, config)
     state = begin(system) if state is None else state
@@ -93,7 +93,7 @@ def begin(system: System, size: GridConfig | None = None) -> SlamState:
     """A run before its first frame, its map of a given size or for what that frame sees."""
     recording, config = system.recording, system.config
     frames = no_frames(len(recording.t))
-    T_world_cam = _first_pose(recording)
+    T_world_cam = first_pose(recording).T_world_cam
     frames.T_world_body[0] = T_world_cam @ np.linalg.inv(recording.T_body_cam)
     if size is None:
         points = seen_points(recording.read(0), recording, T_world_cam)
@@ -151,12 +151,6 @@ def _due(system: System, state: SlamState, frame: Frame) -> bool:
     blank = frame.rgb[::4, ::4].std() < _BLANK
     passed = system.recording.t[i] - system.recording.t[mapped[-1]]
     return bool(not unconfirmed and not blank and passed >= config.map_every_s)
-
-
-def _first_pose(recording: Recording) -> Float[np.ndarray, "4 4"]:
-    if recording.T_world_cam is not None and np.isfinite(recording.T_world_cam[0]).all():
-        return np.array(recording.T_world_cam[0], np.float64)
-    return np.eye(4)
 
 
 def _truth_error(recording: Recording, state: SlamState) -> float:
