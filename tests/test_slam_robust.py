@@ -13,7 +13,7 @@ from jaxpose.camera import Camera
 from jaxpose.data.synthetic import RoomConfig, room
 from jaxpose.recording import Frame, Recording, select
 from jaxpose.slam.keyframes import look
-from jaxpose.slam.localise import _bent, _looks_better, _usual
+from jaxpose.slam.localise import _bent, _looks_better, _unlike, _usual
 from jaxpose.slam.run import SlamConfig, run
 from jaxpose.slam.search import CENTRES, search
 from jaxpose.slam.state import no_frames
@@ -87,6 +87,18 @@ def test_what_is_usual_is_that_of_the_last_frames_found():
     usual = lambda i: _usual(loss[:i], lost[:i])
     assert usual(1) == np.inf and usual(2) == 1 and usual(31) == 15.5
     assert usual(46) == np.median([*range(11, 40), 45])
+
+
+def test_colours_of_another_place_are_doubted_until_they_must_be_another_light():
+    t, frames = np.arange(20) / 4, no_frames(20).put(np.arange(1, 5), colour_error=0.01)
+    assert not _unlike(frames, t, 1, 0.5)  # nothing is usual yet
+    assert not _unlike(frames, t, 5, 0.024) and _unlike(frames, t, 5, 0.026)
+    frames = frames.put(np.arange(5, 12), colour_error=0.1, unlike=True)
+    assert _unlike(frames, t, 11, 0.1) and not _unlike(frames, t, 12, 0.1)  # 2 s after frame 4
+    frames = frames.put(12, colour_error=0.1)
+    assert not _unlike(frames, t, 13, 0.2) and _unlike(frames, t, 13, 0.26)
+    clean = no_frames(20).put(np.arange(1, 5), colour_error=0.001)
+    assert not _unlike(clean, t, 5, 0.019) and _unlike(clean, t, 5, 0.021)
 
 
 def test_a_frame_looks_like_itself_in_another_light():
@@ -189,6 +201,20 @@ def test_bad_frames_are_survived(walk, fault, imu):
     empty = [i for i in range(len(walk.t)) if not read(i).depth.any()]
     assert set(np.flatnonzero(result.lost)) <= set(empty) and result.uncertain[empty].all()
     assert metrics.ate(result.T_world_cam, walk.T_world_cam).rmse < 0.03
+
+
+@pytest.mark.slow
+def test_a_lamp_that_goes_out_is_survived(walk):
+    """Darker than an exposure may be: in doubt for a while, then mapped as it is seen."""
+
+    def read(i):
+        frame = walk.read(i)
+        return frame._replace(rgb=frame.rgb // 10) if i >= 10 else frame
+
+    result = run(walk._replace(read=read))
+    assert not result.lost.any() and metrics.ate(result.T_world_cam, walk.T_world_cam).rmse < 0.03
+    assert result.uncertain[10] and not result.uncertain[:10].any() and not result.uncertain[20:].any()
+    assert not result.mapped[result.uncertain].any() and result.mapped[20:].any()
 
 
 @pytest.mark.slow

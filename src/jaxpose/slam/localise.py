@@ -13,7 +13,7 @@ from jaxpose.recording import Frame
 from jaxpose.slam.config import SlamConfig
 from jaxpose.slam.frames import gauge
 from jaxpose.slam.keyframes import look
-from jaxpose.slam.observe import Image
+from jaxpose.slam.observe import Image, is_blank
 from jaxpose.slam.predict import (
     BEHIND,
     Interval,
@@ -42,6 +42,9 @@ _LEAST_DEPTH = 0.01  # share of an image
 _PULLED = 0.03  # [m, rad] as far off as colour still pulls
 _WORSE_COLOUR, _BETTER_COLOUR = 1.5, 0.9  # against the usual error, and that of another pose
 _AS_MUCH, _AS_WELL = 0.7, 1.3  # share explained and loss against another pose's
+_OTHER_COLOUR = 2.5  # against the usual error; measured at most 2.2 at true poses, 2.6 and more beside them
+_LEAST_COLOUR = 0.008  # an error that images without noise stay below; less says nothing
+_OTHER_LIGHT_S = 2.0
 _FADING_S = 0.5  # in which a speed that nothing senses is forgotten
 
 
@@ -81,7 +84,9 @@ def next_pose(
     unknown_place = lost and tracked.valid < config.track.minimum_valid
     if unknown_place and config.senses_speed and max(reach) < _RECKONED:
         return _moved(system, state, state.frames, ahead, None, lost=False)
-    return _moved(system, state, frames, ahead, tracked, lost)
+    seen = not lost and not is_blank(frame)
+    unlike = seen and _unlike(frames, system.recording.t, state.done, float(tracked.colour_error))
+    return _moved(system, state, frames, ahead, tracked, lost, unlike)
 
 
 def _ahead(system: System, state: SlamState) -> Ahead:
@@ -108,7 +113,13 @@ def _straight(ahead: Ahead, found: Float[np.ndarray, "4 4"]) -> Ahead:
 
 
 def _moved(
-    system: System, state: SlamState, frames: Frames, ahead: Ahead, tracked: Tracked | None, lost: bool
+    system: System,
+    state: SlamState,
+    frames: Frames,
+    ahead: Ahead,
+    tracked: Tracked | None,
+    lost: bool,
+    unlike: bool = False,
 ) -> SlamState:
     """The state after an interval: with the tracked motion, or with the predicted one where that is lost."""
     config, i, dt, predicted = system.config, state.done, ahead.dt, ahead.T_ref_body[-1]
@@ -121,17 +132,17 @@ def _moved(
     T_world_ref = frames.T_world_body[i - 1]
     T_world_body = T_world_ref @ T_ref_body
     T_world_body[:3, :3] = nearest_rotation(T_world_body[:3, :3])  # float32 adds up
+    sure = tracked is not None and not lost and not unlike and _last_found(frames, i) == i - 1
     false_acceleration = state.false_acceleration
-    if (
-        i > 1 and tracked is not None and not lost and not frames.lost[i - 1] and config.senses_speed
-    ):  # else the speed is not known
+    if i > 1 and sure and config.senses_speed:  # else the speed is not known
         error = T_world_ref[:3, :3] @ (T_ref_body[:3, 3] - predicted[:3, 3])
         false_acceleration = observe_acceleration(false_acceleration, dt, error)
     gyro_bias, gyro_bias_sigma = state.gyro_bias, state.gyro_bias_sigma
-    if config.senses_rotation and tracked is not None and not lost and not frames.lost[i - 1]:
+    if sure and config.senses_rotation:
         off = predicted[:3, :3].T @ T_ref_body[:3, :3]
         gyro_bias, gyro_bias_sigma = observe_gyro_bias(gyro_bias, gyro_bias_sigma, dt, off)
-    frames = frames.put(i, T_world_body=T_world_body, lost=lost, uncertain=_uncertain(tracked, lost))
+    uncertain = unlike or _uncertain(tracked, lost)
+    frames = frames.put(i, T_world_body=T_world_body, lost=lost, unlike=unlike, uncertain=uncertain)
     if tracked is not None:
         frames = frames.put(
             i,
@@ -192,8 +203,8 @@ def _reach(system: System, state: SlamState, ahead: Ahead) -> np.ndarray:
 
 
 def _last_found(frames: Frames, i: int) -> int:
-    """The last frame before i that was not lost."""
-    return int(np.flatnonzero(~frames.lost[:i])[-1])
+    """The last frame before i that is not in doubt."""
+    return int(np.flatnonzero(~(frames.lost | frames.unlike)[:i])[-1])
 
 
 def _searched(
@@ -205,7 +216,7 @@ def _searched(
     reach: np.ndarray,
     key: PRNGKeyArray,
 ) -> tuple[Frames, Float[np.ndarray, "4 4"]]:
-    """The motion that a wide search finds, lost frames bent to lead there.
+    """The motion that a wide search finds, frames in doubt bent to lead there.
 
     After a loss, poses of keyframes within reach that look alike are searched around too.
     """
@@ -237,7 +248,7 @@ def _searched(
 
 
 def _bent(frames: Frames, t: np.ndarray, last: int, i: int, T_predicted_found: np.ndarray) -> Frames:
-    """The frames lost between `last` and i moved by their share of what the prediction at i was off."""
+    """The frames between `last` and i moved by their share of what the prediction at i was off."""
     lost = np.arange(last + 1, i)
     share = (t[lost] - t[last]) / (t[i] - t[last])
     off = np.asarray(se3.log(jnp.asarray(T_predicted_found, jnp.float32)), np.float64)
@@ -306,7 +317,18 @@ def _doubtful(state: SlamState, tracked: Tracked, ahead: Ahead) -> bool:
     frames, i = state.frames, state.done
     if i == 1:
         return float(ahead.sigma.max()) > _PULLED
-    return float(tracked.colour_error) > _WORSE_COLOUR * _usual(frames.colour_error[:i], frames.lost[:i])
+    return float(tracked.colour_error) > _WORSE_COLOUR * _usual_colour(frames, i)
+
+
+def _unlike(frames: Frames, t: Float[np.ndarray, " n"], i: int, colour_error: float) -> bool:
+    """Whether frame i fits in shape, but so badly in colour that it is at another place, or in another light.
+
+    Nothing is mapped from a wrong place. A light stays, so after a while it is taken as one, and what follows
+    is held against the first frame in it.
+    """
+    last = _last_found(frames, i)
+    usual = max(_usual_colour(frames, i), np.nan_to_num(frames.colour_error[last]), _LEAST_COLOUR)
+    return bool(colour_error > _OTHER_COLOUR * usual and t[i] - t[last] < _OTHER_LIGHT_S)
 
 
 def _looks_better(other: Tracked, tracked: Tracked) -> bool:
@@ -318,7 +340,11 @@ def _looks_better(other: Tracked, tracked: Tracked) -> bool:
     )
 
 
-def _usual(values: Float[np.ndarray, " i"], lost: Bool[np.ndarray, " i"]) -> float:
-    """The median over the last 30 frames that were found; infinite before the first."""
-    found = values[~lost & np.isfinite(values)][-30:]
+def _usual_colour(frames: Frames, i: int) -> float:
+    return _usual(frames.colour_error[:i], (frames.lost | frames.unlike)[:i])
+
+
+def _usual(values: Float[np.ndarray, " i"], doubted: Bool[np.ndarray, " i"]) -> float:
+    """The median over the last 30 frames that are in no doubt; infinite before the first."""
+    found = values[~doubted & np.isfinite(values)][-30:]
     return float(np.median(found)) if len(found) else np.inf

@@ -14,6 +14,8 @@ from jaxpose.camera import Camera, pixel_direction, project
 from jaxpose.recording import Frame
 from jaxpose.render import Query, Ray, Rendered
 
+_BLANK = 3.0  # [grey levels] spread of an image that is black or saturated
+
 
 class Image(NamedTuple):
     """One RGB-D image on the device; depth along the optical axis [m], 0 where there is none.
@@ -29,6 +31,11 @@ class Image(NamedTuple):
 def to_device(frame: Frame) -> Image:
     """A frame where it is computed with."""
     return Image(jnp.asarray(frame.rgb), jnp.asarray(frame.depth, jnp.float32))
+
+
+def is_blank(frame: Frame) -> bool:
+    """Whether an image's colour says nothing: black, or saturated."""
+    return bool(frame.rgb[::4, ::4].std() < _BLANK)
 
 
 class Pixels(NamedTuple):

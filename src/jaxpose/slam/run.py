@@ -17,7 +17,7 @@ from jaxpose.slam.config import ImuMode, SlamConfig
 from jaxpose.slam.first_pose import first_pose
 from jaxpose.slam.keyframes import read_keyframes
 from jaxpose.slam.localise import next_pose
-from jaxpose.slam.observe import to_device
+from jaxpose.slam.observe import is_blank, to_device
 from jaxpose.slam.paint import paint, painted
 from jaxpose.slam.predict import GYRO_BIAS_SIGMA
 from jaxpose.slam.reframe import Refit, due, window
@@ -28,7 +28,6 @@ from jaxpose.slam.world import first_grid, map_frame, room_for, scene_params, se
 __all__ = ["ImuMode", "Progress", "SlamConfig", "SlamResult", "run"]
 
 _DEFAULT = SlamConfig()
-_BLANK = 3.0  # [grey levels] spread of an image that is black or saturated
 
 
 class Progress(NamedTuple):
@@ -46,7 +45,7 @@ class SlamResult(NamedTuple):
     T_world_cam: np.ndarray  # (n, 4, 4)
     T_inner: np.ndarray  # (n, 4, 4) the body's motion since the last frame, in the frame `intrinsic`
     lost: np.ndarray  # (n,) bool: tracking failed, the pose is the prediction
-    uncertain: np.ndarray  # (n,) bool: lost, reckoned from the IMU, or little in the image to hold on to
+    uncertain: np.ndarray  # (n,) bool: lost, unlike the map in colour, from the IMU, or little to hold on to
     mapped: np.ndarray  # (n,) bool: the map was made from it
     iterations: np.ndarray  # (n,)
     loss: np.ndarray  # (n,)
@@ -145,12 +144,12 @@ def _due(system: System, state: SlamState, frame: Frame) -> bool:
     config, frames, i = system.config, state.frames, state.done - 1
     held_out = config.hold_out > 0 and i % config.hold_out == config.hold_out - 1
     mapped = np.flatnonzero(frames.mapped)
-    if held_out or frames.lost[i] or not len(mapped):
-        return not held_out and not frames.lost[i]
+    doubted = frames.lost[i] or frames.unlike[i]
+    if held_out or doubted or not len(mapped):
+        return not held_out and not doubted
     unconfirmed = frames.lost[i - 1] and not config.senses_speed
-    blank = frame.rgb[::4, ::4].std() < _BLANK
     passed = system.recording.t[i] - system.recording.t[mapped[-1]]
-    return bool(not unconfirmed and not blank and passed >= config.map_every_s)
+    return bool(not unconfirmed and not is_blank(frame) and passed >= config.map_every_s)
 
 
 def _truth_error(recording: Recording, state: SlamState) -> float:

@@ -16,7 +16,8 @@ class Frames(NamedTuple):
     T_world_body: Float[np.ndarray, "n 4 4"]
     T_inner: Float[np.ndarray, "n 4 4"]  # motion since the last frame, in the frame `intrinsic`
     lost: Bool[np.ndarray, " n"]  # tracking failed, the pose is the prediction
-    uncertain: Bool[np.ndarray, " n"]  # lost, reckoned from the IMU, or little in the image to hold on to
+    unlike: Bool[np.ndarray, " n"]  # surfaces fit, but colours far worse than usual
+    uncertain: Bool[np.ndarray, " n"]  # lost, unlike, reckoned from the IMU, or little to hold on to
     mapped: Bool[np.ndarray, " n"]  # the map was made from it
     keyframe: Bool[np.ndarray, " n"]
     iterations: Int[np.ndarray, " n"]
@@ -60,6 +61,7 @@ def no_frames(count: int) -> Frames:
         T_world_body=np.full((count, 4, 4), np.nan),
         T_inner=np.full((count, 4, 4), np.nan),
         lost=no,
+        unlike=no,
         uncertain=no,
         mapped=no,
         keyframe=no,
