@@ -209,12 +209,15 @@ def _cross(a: Float[Array, "*n 3"], b: Float[Array, "*n 3"]) -> Float[Array, "*n
 
 
 def _rotate(R: Float[Array, "*#n k k"], p: Float[Array, "*#n k"]) -> Float[Array, "*n k"]:
-    return _product(R, p[..., None])[..., 0]
+    """The matrix times a vector, term by term, so that XLA fuses it with what is done to very many points."""
+    batch = jnp.broadcast_shapes(R.shape[:-2], p.shape[:-1])
+    R, p = jnp.broadcast_to(R, (*batch, *R.shape[-2:])), jnp.broadcast_to(p, (*batch, p.shape[-1]))
+    terms = [R[..., :, k] * p[..., k, None] for k in range(p.shape[-1])]
+    return sum(terms[1:], terms[0])
 
 
 def _product(a: Float[Array, "*#n i k"], b: Float[Array, "*#n k j"]) -> Float[Array, "*n i j"]:
-    """The matrix product, written out: never in TF32, and fused by XLA (small batched dots are slow)."""
+    """The matrix product as one sum: never in TF32 (and small batched dots are slow), and soon compiled."""
     batch = jnp.broadcast_shapes(a.shape[:-2], b.shape[:-2])
     a, b = jnp.broadcast_to(a, (*batch, *a.shape[-2:])), jnp.broadcast_to(b, (*batch, *b.shape[-2:]))
-    terms = [a[..., :, k, None] * b[..., k, None, :] for k in range(a.shape[-1])]
-    return sum(terms[1:], terms[0])
+    return jnp.sum(a[..., :, :, None] * b[..., None, :, :], axis=-2)

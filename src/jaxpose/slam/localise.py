@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, PRNGKeyArray
 
-from jaxpose import se3
 from jaxpose.metrics import nearest_rotation, rotation_angle_deg
 from jaxpose.recording import Frame
 from jaxpose.slam.config import SlamConfig
@@ -19,6 +18,8 @@ from jaxpose.slam.predict import (
     Interval,
     Readings,
     end_velocity,
+    exp,
+    log,
     observe_acceleration,
     observe_gyro_bias,
     predict,
@@ -105,9 +106,9 @@ def _ahead(system: System, state: SlamState) -> Ahead:
 
 def _straight(ahead: Ahead, found: Float[np.ndarray, "4 4"]) -> Ahead:
     """At one speed to a motion that a search has found."""
-    twist = np.asarray(se3.log(jnp.asarray(found, jnp.float32)))
+    twist = log(found)
     share = np.arange(1, len(ahead.stamps) + 1) / len(ahead.stamps)
-    T_ref_body = np.asarray(se3.exp(jnp.asarray(share[:, None] * twist, jnp.float32)), np.float64)
+    T_ref_body = exp(share[:, None] * twist)
     sigma = np.minimum(ahead.sigma, FOUND_SIGMA)
     return ahead._replace(stamps=ahead.dt * share, T_ref_body=T_ref_body, sigma=sigma)
 
@@ -157,7 +158,7 @@ def _moved(
     velocity_body = end_velocity(dt, T_ref_body, ahead.readings, speed=config.senses_speed)
     return state._replace(
         frames=frames,
-        twist=fade * np.asarray(se3.log(jnp.asarray(T_ref_body, jnp.float32)), np.float64) / dt,
+        twist=fade * log(T_ref_body) / dt,
         velocity_body=velocity_body if config.senses_speed else fade * velocity_body,
         gyro_bias=gyro_bias,
         gyro_bias_sigma=gyro_bias_sigma,
@@ -251,8 +252,7 @@ def _bent(frames: Frames, t: np.ndarray, last: int, i: int, T_predicted_found: n
     """The frames between `last` and i moved by their share of what the prediction at i was off."""
     lost = np.arange(last + 1, i)
     share = (t[lost] - t[last]) / (t[i] - t[last])
-    off = np.asarray(se3.log(jnp.asarray(T_predicted_found, jnp.float32)), np.float64)
-    correction = np.asarray(se3.exp(jnp.asarray(share[:, None] * off, jnp.float32)), np.float64)
+    correction = exp(share[:, None] * log(T_predicted_found))
     return frames.put(lost, T_world_body=frames.T_world_body[lost] @ correction)
 
 

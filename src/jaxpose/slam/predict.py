@@ -38,6 +38,19 @@ class Readings(NamedTuple):
     position_ref: Float[Array, "s 3"]  # and twice [m]
 
 
+_exp, _log = jax.jit(se3.exp), jax.jit(se3.log)  # a call at a time compiles every operation by itself
+
+
+def exp(xi: Float[np.ndarray, "*n 6"]) -> Float[np.ndarray, "*n 4 4"]:
+    """`se3.exp` of arrays on the host, float64 with the digits of float32."""
+    return np.asarray(_exp(jnp.asarray(xi, jnp.float32)), np.float64)
+
+
+def log(T: Float[np.ndarray, "*n 4 4"]) -> Float[np.ndarray, "*n 6"]:
+    """`se3.log` of arrays on the host, float64 with the digits of float32."""
+    return np.asarray(_log(jnp.asarray(T, jnp.float32)), np.float64)
+
+
 @jax.jit
 def integrate(
     imu: Imu, mask: Bool[Array, " s"], R_world_ref: Float[Array, "3 3"], gravity_world: Float[Array, "3"]
@@ -76,7 +89,7 @@ def predict(
     where there are no readings, both stay as they were.
     """
     stamps = t * np.arange(1, AHEAD + 1) / AHEAD
-    steady = np.asarray(se3.exp(jnp.asarray(stamps[:, None] * twist, jnp.float32)), np.float64)
+    steady = exp(stamps[:, None] * twist)
     count = int(np.sum(np.asarray(readings.mask)))
     if not rotation or count < 2:
         return stamps, steady

@@ -102,7 +102,7 @@ def begin(system: System, size: GridConfig | None = None) -> SlamState:
     key, field_key = jax.random.split(jax.random.key(config.seed))
     return SlamState(
         0, frames, np.zeros(6), np.zeros(3), np.zeros(3), GYRO_BIAS_SIGMA, np.zeros(3),
-        system.framed.field.init(field_key), key, np.ones(3, np.float32), 0.0, size,
+        jax.jit(system.framed.field.init)(field_key), key, np.ones(3, np.float32), 0.0, size,
         system.world(size).start(),
     )  # fmt: skip
 
@@ -174,7 +174,7 @@ def _finish(system: System, state: SlamState) -> SlamResult:
     field = bspline(span, intervals)
     knots = (np.arange(intervals + 3) - 1) * (t[-1] / intervals)
     between = jax.vmap(stamped(jnp.asarray(t, jnp.float32), jnp.asarray(T_world_cam, jnp.float32)))
-    start = control_points(between(jnp.asarray(knots, jnp.float32)))
+    start = jax.jit(lambda at: control_points(between(at)))(jnp.asarray(knots, jnp.float32))
     fitted = fit(field, t, T_world_cam, params=start, steps=400, learning_rate=1e-3)
     scene, (values,) = system.world(state.grid).scene, scene_params(state.map)
     keyframes = np.flatnonzero(frames.keyframe)
