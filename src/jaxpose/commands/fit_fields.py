@@ -78,7 +78,7 @@ def bspline(span_s: float, knots_hz: float) -> Candidate:
         first, last = float(trajectory.t[0]), float(trajectory.t[-1])
         knots = first + (np.arange(intervals + 3) - 1) * ((last - first) / intervals)
         given = fields.stamped(*(jnp.asarray(x, jnp.float32) for x in trajectory))
-        return fields.control_points(jax.vmap(given)(jnp.asarray(knots, jnp.float32)))
+        return jax.jit(lambda at: fields.control_points(jax.vmap(given)(at)))(jnp.asarray(knots, jnp.float32))
 
     return Candidate(
         f"B-spline {knots_hz:g} knots/s",
@@ -119,9 +119,8 @@ def fit_field(
     result = fields.fit(field, seen.t, seen.T, params=start, steps=steps, learning_rate=candidate.rate)
     params = jax.block_until_ready(result.params)
     seconds = time.perf_counter() - started
-    T = np.asarray(
-        jax.jit(jax.vmap(partial(field.pose, params)))(jnp.asarray(local.t[held], jnp.float32)), np.float64
-    )
+    poses = jax.jit(jax.vmap(field.pose, (None, 0)))  # parameters as constants would be worked on for seconds
+    T = np.asarray(poses(params, jnp.asarray(local.t[held], jnp.float32)), np.float64)
     distance = around.scale * np.linalg.norm(T[:, :3, 3] - local.T[held, :3, 3], axis=1)
     angle = metrics.rotation_angle_deg(T[:, :3, :3], local.T[held, :3, :3])
     span = (around.t0, around.t0 + float(local.t[-1]))
@@ -203,8 +202,8 @@ def _into(around: Frame, trajectory: Trajectory) -> Trajectory:
 
 
 def _inertial(field: PoseField, params: Any, around: Frame, imu: Imu) -> Inertial:
-    at = jax.jit(jax.vmap(lambda t: motion(partial(field.pose, params), t)))
-    moved = at(jnp.asarray(np.asarray(imu.t) - around.t0, jnp.float32))
+    at = jax.jit(jax.vmap(lambda params, t: motion(partial(field.pose, params), t), (None, 0)))
+    moved = at(params, jnp.asarray(np.asarray(imu.t) - around.t0, jnp.float32))
     R = np.asarray(moved.pose[:, :3, :3], np.float64)
     omega = np.asarray(moved.omega_body, np.float64) - np.asarray(imu.omega_body)
     free = around.scale * np.einsum("nji,nj->ni", R, np.asarray(moved.acceleration_world, np.float64))

@@ -114,8 +114,8 @@ def accuracy(
     ate = metrics.ate(result.T_world_cam, T_world_true)
     aligned = metrics.align(ate.alignment, result.T_world_cam)
     rotation_deg = metrics.rotation_angle_deg(aligned[:, :3, :3], T_world_true[:, :3, :3])
-    field = jax.jit(jax.vmap(partial(result.field.pose, result.field_params)))
-    field_poses = np.asarray(field(jnp.asarray(t, jnp.float32)), np.float64)
+    field = jax.jit(jax.vmap(result.field.pose, (None, 0)))
+    field_poses = np.asarray(field(result.field_params, jnp.asarray(t, jnp.float32)), np.float64)
     numbers = {
         "alignment": "se3",
         "ate_rmse_m": ate.rmse,
