@@ -74,11 +74,8 @@ def test_a_made_sequence_reads_back(desk, walk, metres):
     assert truth == "1 frames without a usable pose (none within 0.02 s): 1305031102.134000"
 
 
-KINECT = {
-    "left": [-1, 0, 0],
-    "up": [0, -1, 0],
-    "forward": [0, 0, 1],
-}  # the accelerometer's axes in the camera's
+# The accelerometer's axes in the camera's.
+KINECT = {"left": [-1, 0, 0], "up": [0, -1, 0], "forward": [0, 0, 1]}
 
 
 def held(folder, T_world_cam, turned="left up forward"):

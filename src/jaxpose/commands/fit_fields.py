@@ -74,17 +74,11 @@ def bspline(span_s: float, knots_hz: float) -> Candidate:
     """A cubic B-spline with so many knots a second, half of which is the fastest that it can follow."""
     intervals = max(1, round(span_s * knots_hz))
 
-    def start(field, trajectory):
-        first, last = float(trajectory.t[0]), float(trajectory.t[-1])
-        knots = first + (np.arange(intervals + 3) - 1) * ((last - first) / intervals)
-        given = fields.stamped(*(jnp.asarray(x, jnp.float32) for x in trajectory))
-        return jax.jit(lambda at: fields.control_points(jax.vmap(given)(at)))(jnp.asarray(knots, jnp.float32))
-
     return Candidate(
         f"B-spline {knots_hz:g} knots/s",
         knots_hz / 2,
         lambda span: fields.bspline(span, intervals),
-        start,
+        lambda field, trajectory: fields.control_points_along(trajectory.t, trajectory.T, intervals),
         _SPLINE_RATE,
         bspline_factor,
     )

@@ -5,6 +5,7 @@ from jaxpose.fields.base import PoseField as PoseField
 from jaxpose.fields.base import PoseFn as PoseFn
 from jaxpose.fields.bspline import bspline as bspline
 from jaxpose.fields.bspline import control_points as control_points
+from jaxpose.fields.bspline import control_points_along as control_points_along
 from jaxpose.fields.composition import anchored as anchored
 from jaxpose.fields.composition import body_to_camera as body_to_camera
 from jaxpose.fields.composition import in_frame as in_frame

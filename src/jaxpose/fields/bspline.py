@@ -2,10 +2,12 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxpose import se3
 from jaxpose.fields.base import PoseField
+from jaxpose.fields.composition import stamped
 
 
 def bspline(span: tuple[float, float], intervals: int) -> PoseField:
@@ -51,6 +53,23 @@ def control_points(control_poses: Float[Array, "n 4 4"]) -> Float[Array, "n 7"]:
     sign = jnp.cumprod(jnp.where(same, 1, -1).astype(quaternion.dtype), axis=0)
     quaternion = jnp.concatenate([quaternion[:1], sign * quaternion[1:]])
     return jnp.concatenate([control_poses[:, :3, 3], _from_identity(quaternion, -1)], axis=-1)
+
+
+def control_points_along(
+    times: Float[np.ndarray, " m"], poses: Float[np.ndarray, "m 4 4"], intervals: int
+) -> Float[Array, "n 7"]:
+    """The parameters of a spline over stamped poses whose control poses lie on them (`stamped`), as a start.
+
+    Its span is from the first of `times` [s] to the last, in `intervals` knot intervals.
+    """
+    first, last = float(times[0]), float(times[-1])
+    knots = first + (np.arange(intervals + 3) - 1) * ((last - first) / intervals)
+    return _control_points_at(*(jnp.asarray(x, jnp.float32) for x in (knots, times, poses)))
+
+
+@jax.jit
+def _control_points_at(knots, times, poses):
+    return control_points(jax.vmap(stamped(times, poses))(knots))
 
 
 def _cumulative_basis(s: Float[Array, ""]) -> Float[Array, "3"]:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxpose.errors import DataError
-from jaxpose.fields import PoseField, bspline, control_points, fit, stamped
+from jaxpose.fields import PoseField, bspline, control_points_along, fit
 from jaxpose.recording import Frame, Recording
 from jaxpose.scenes import GridConfig, SceneField
 from jaxpose.slam.config import ImuMode, SlamConfig
@@ -172,9 +172,7 @@ def _finish(system: System, state: SlamState) -> SlamResult:
     span = (0.0, float(t[-1]))
     intervals = max(round(t[-1] / float(np.median(np.diff(t)))), 1)
     field = bspline(span, intervals)
-    knots = (np.arange(intervals + 3) - 1) * (t[-1] / intervals)
-    between = jax.vmap(stamped(jnp.asarray(t, jnp.float32), jnp.asarray(T_world_cam, jnp.float32)))
-    start = jax.jit(lambda at: control_points(between(at)))(jnp.asarray(knots, jnp.float32))
+    start = control_points_along(t, T_world_cam, intervals)
     fitted = fit(field, t, T_world_cam, params=start, steps=400, learning_rate=1e-3)
     scene, (values,) = system.world(state.grid).scene, scene_params(state.map)
     keyframes = np.flatnonzero(frames.keyframe)

@@ -1,0 +1,43 @@
+"""SLAM with a real IMU or its stand-in where no pose is known: the truth is taken away, and only measures.
+
+Options are those of `python -m jaxpose.experiments.imu_slam`. Printed are the world's tilt against the true
+vertical, the ATE after SE(3) alignment, frames lost and uncertain, and how the errors of colour compare to
+their median: at frames within 4 cm of the true motion from the last one, and at the others.
+
+    python benchmarks/without_truth.py --help
+"""
+
+import numpy as np
+import tyro
+
+from jaxpose import metrics
+from jaxpose.experiments.imu_slam import Config
+from jaxpose.experiments.slam_options import load, slam_config
+from jaxpose.slam.first_pose import first_pose
+from jaxpose.slam.run import run
+
+RIGHT = 0.04  # [m] of a motion from one frame to the next
+
+
+def main() -> None:
+    config = tyro.cli(Config, description=__doc__)
+    recording = load(config).recording
+    truth = recording.T_world_cam
+    assert truth is not None, "expected a recording with true poses to measure against"
+    recording = recording._replace(T_world_cam=None)
+    up = first_pose(recording).T_world_cam[2, :3] @ truth[0, 2, :3]
+    result = run(recording, slam_config(config))
+    ate = metrics.ate(result.T_world_cam, truth)
+    moved, moved_true = (np.linalg.inv(T[:-1]) @ T[1:] for T in (result.T_world_cam, truth))
+    right = np.linalg.norm((moved - moved_true)[:, :3, 3], axis=1) < RIGHT
+    ratio = result.colour_error[1:] / np.nanmedian(result.colour_error)
+    print(f"{recording.name}, {len(recording.t)} frames, IMU {config.slam.imu}, seed {config.slam.seed}")
+    print(f"  tilt {np.rad2deg(np.arccos(min(up, 1.0))):.2f} deg, ATE {100 * ate.rmse:.2f} cm")
+    print(f"  {result.lost.sum()} frames lost, {result.uncertain.sum()} uncertain")
+    print(f"  colour at {right.sum()} right motions: at most {np.nanmax(ratio[right]):.2f} times the median")
+    if not right.all():
+        print(f"  colour at the others: {np.round(ratio[~right], 2).tolist()}")
+
+
+if __name__ == "__main__":
+    main()
