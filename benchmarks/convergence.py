@@ -17,10 +17,10 @@ import tyro
 from timing import machine
 from tracking import FIELDS, make_loss, room
 
-from jaxpose import se3
 from jaxpose.fields import pin, posenet
-from jaxpose.metrics import rotation_angle_deg
-from jaxpose.slam.objective import TrackConfig
+from jaxpose.geometry import se3
+from jaxpose.geometry.rigid import rotation_angle_deg
+from jaxpose.slam.tracking.objective import TrackConfig
 
 
 @dataclass(frozen=True)

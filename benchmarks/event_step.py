@@ -15,12 +15,14 @@ import numpy as np
 import tyro
 from timing import in_turn, machine, milliseconds, product_gflops
 
-from jaxpose import fields, io, nerf_events, scenes
-from jaxpose.camera import Camera
+from jaxpose import fields, scenes
 from jaxpose.events import Streams
-from jaxpose.nerf import Depths
-from jaxpose.nerf_events import EventData, EventTrainConfig
-from jaxpose.train import Rate, Trainer
+from jaxpose.files import run_folder
+from jaxpose.geometry.camera import Camera
+from jaxpose.training import events as event_training
+from jaxpose.training.events import EventData, EventTrainConfig
+from jaxpose.training.photometric import Depths
+from jaxpose.training.steps import Rate, Trainer
 
 WIDTH, HEIGHT = 346, 260
 CAMERA = Camera(400.0, 400.0, 172.5, 129.5, WIDTH, HEIGHT)
@@ -53,12 +55,12 @@ def data(count: int) -> EventData:
     return EventData(streams, jnp.ones((WIDTH * HEIGHT, 3)))
 
 
-def trainer(loss: nerf_events.Loss, config: Config, chunk: int) -> Trainer:
+def trainer(loss: event_training.Loss, config: Config, chunk: int) -> Trainer:
     field = fields.posenet(fields.PoseNetConfig(span=SPAN))
     start = jnp.eye(4).at[2, 3].set(-4.0)
     field = fields.refine(field, lambda t: start)
     train = EventTrainConfig(events=config.events, samples=config.samples, chunk=chunk, loss=loss)
-    return nerf_events.trainer(
+    return event_training.trainer(
         scenes.nerf(), field, CAMERA, Depths(2.0, 6.0), SPAN, Rate(5e-4, 5e-4), RATES, train
     )
 
@@ -82,7 +84,7 @@ def main() -> None:
     for loss, taken in times.items():
         rate = gflop[loss] / np.median(taken)
         print(f"  {loss:13} {milliseconds(taken)}, {gflop[loss]:7.1f} GFLOP, {rate:4.0f} GFLOP/s")
-    print(f"  {io.peak_rss_bytes() / 2**30:.2f} GiB of memory at most")
+    print(f"  {run_folder.peak_rss_bytes() / 2**30:.2f} GiB of memory at most")
 
 
 if __name__ == "__main__":

@@ -15,10 +15,12 @@ import numpy as np
 import tyro
 from timing import in_turn, machine, milliseconds, product_gflops
 
-from jaxpose import fields, io, nerf, scenes
-from jaxpose.camera import Camera
-from jaxpose.nerf import Depths, TrainConfig, Views
-from jaxpose.train import Rate, Trainer
+from jaxpose import fields, scenes
+from jaxpose.files import run_folder
+from jaxpose.geometry.camera import Camera
+from jaxpose.training import photometric
+from jaxpose.training.photometric import Depths, TrainConfig, Views
+from jaxpose.training.steps import Rate, Trainer
 
 SIZE, IMAGES = 400, 100
 CAMERA = Camera(555.6, 555.6, 199.5, 199.5, SIZE, SIZE)
@@ -44,7 +46,7 @@ def trainer(pose: str, config: TrainConfig) -> Trainer:
         rates = {"translation": Rate(1e-3, 1e-5), "rotation": Rate(2e-4, 1e-6)}
     start = jnp.eye(4).at[2, 3].set(-4.0)
     field = fields.refine(field, lambda t: start)
-    return nerf.trainer(scenes.nerf(), field, CAMERA, DEPTHS, Rate(5e-4, 1e-4), rates, config)
+    return photometric.trainer(scenes.nerf(), field, CAMERA, DEPTHS, Rate(5e-4, 1e-4), rates, config)
 
 
 def main() -> None:
@@ -74,7 +76,7 @@ def main() -> None:
                 f"{sizes[pose]:,} parameters"
             )
         added = 100 * (np.median(times["posenet"] / times["table"]) - 1)
-        most = io.peak_rss_bytes() / 2**30
+        most = run_folder.peak_rss_bytes() / 2**30
         print(f"  PoseNet adds {added:.1f}% of time; {most:.2f} GiB of memory at most so far")
 
 

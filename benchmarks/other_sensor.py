@@ -18,13 +18,13 @@ import tyro
 from scipy.ndimage import gaussian_filter
 from tqdm import tqdm
 
-from jaxpose import io
-from jaxpose.camera import Camera
-from jaxpose.data.synthetic import sensor
-from jaxpose.data.synthetic.furniture import SIZE
-from jaxpose.data.synthetic.walkthrough import render, scenery
-from jaxpose.imu_simulation import Interpolant, interpolant
-from jaxpose.metrics import rotation_angle_deg
+from jaxpose.datasets.synthetic import sensor
+from jaxpose.datasets.synthetic.furniture import SIZE
+from jaxpose.datasets.synthetic.room_renderer import render, scenery
+from jaxpose.files import trajectories
+from jaxpose.geometry.camera import Camera
+from jaxpose.geometry.rigid import rotation_angle_deg
+from jaxpose.imu.simulation import Interpolant, interpolant
 
 FOCAL = 585.0  # [px]
 DISPARITY = 580 * sensor.BASELINE  # [px m]
@@ -48,7 +48,7 @@ class Config:
     farthest: float = 4.5  # [m]
 
 
-def moved_to_the_room(trajectory: io.Trajectory) -> Interpolant:
+def moved_to_the_room(trajectory: trajectories.Trajectory) -> Interpolant:
     """The path over time since the first stamp, its middle above that of the floor."""
     T = trajectory.T.copy()
     T[:, :2, 3] -= (T[:, :2, 3].min(axis=0) + T[:, :2, 3].max(axis=0)) / 2
@@ -65,7 +65,7 @@ def measured(depth: np.ndarray, rng: np.random.Generator, config: Config) -> np.
 
 def main() -> None:
     config = tyro.cli(Config, description=__doc__)
-    path = moved_to_the_room(io.read_tum(config.trajectory, first_of_equal=True))
+    path = moved_to_the_room(trajectories.read_tum(config.trajectory, first_of_equal=True))
     camera = Camera(FOCAL, FOCAL, 318.6, 241.3, 640, 480)
     shapes, atlas = scenery(config.seed, SIZE)
     seen = lambda T: [np.asarray(x) for x in render(camera, shapes, atlas, np.float32(T))]

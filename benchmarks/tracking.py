@@ -16,13 +16,13 @@ import optax
 import tyro
 from timing import in_turn, machine, milliseconds
 
-from jaxpose import se3
-from jaxpose.camera import Camera
+from jaxpose.datasets.types import Frame
 from jaxpose.fields import PoseNetConfig, posenet
-from jaxpose.recording import Frame
+from jaxpose.geometry import se3
+from jaxpose.geometry.camera import Camera
 from jaxpose.scenes import box, grid, node_positions
-from jaxpose.slam.objective import TrackConfig, image_loss, image_residuals
-from jaxpose.slam.observe import SampleConfig, sample_pixels, to_device
+from jaxpose.slam.observation import SampleConfig, sample_pixels, to_device
+from jaxpose.slam.tracking.objective import TrackConfig, image_loss, image_residuals
 
 CAMERA = Camera(585.0, 585.0, 320.0, 240.0, 640, 480)
 FIELDS = {

@@ -10,11 +10,11 @@ their median: at frames within 4 cm of the true motion from the last one, and at
 import numpy as np
 import tyro
 
-from jaxpose import metrics
+from jaxpose.evaluation import trajectory_error
 from jaxpose.experiments.imu_slam import Config
-from jaxpose.experiments.slam_options import load, slam_config
-from jaxpose.slam.first_pose import first_pose
-from jaxpose.slam.run import run
+from jaxpose.experiments.slam.options import load, slam_config
+from jaxpose.slam.initial_pose import first_pose
+from jaxpose.slam.pipeline import run
 
 RIGHT = 0.04  # [m] of a motion from one frame to the next
 
@@ -27,7 +27,7 @@ def main() -> None:
     recording = recording._replace(T_world_cam=None)
     up = first_pose(recording).T_world_cam[2, :3] @ truth[0, 2, :3]
     result = run(recording, slam_config(config))
-    ate = metrics.ate(result.T_world_cam, truth)
+    ate = trajectory_error.ate(result.T_world_cam, truth)
     moved, moved_true = (np.linalg.inv(T[:-1]) @ T[1:] for T in (result.T_world_cam, truth))
     right = np.linalg.norm((moved - moved_true)[:, :3, 3], axis=1) < RIGHT
     ratio = result.colour_error[1:] / np.nanmedian(result.colour_error)

@@ -10,9 +10,9 @@ import optax
 from scipy.spatial.transform import Rotation
 
 from jaxpose.fields import PoseNetConfig, posenet
+from jaxpose.fields.derivatives import motion
 from jaxpose.imu import gyro_tight_residual
 from jaxpose.losses import weighted_mean
-from jaxpose.motion import motion
 from jaxpose.render import Ray, render_ray, surface_weights
 
 TIMES = jnp.linspace(0.0, 1.0, 5)
@@ -95,7 +95,7 @@ def test_a_trajectory_is_found_through_their_scene_and_gyroscope():
 def test_importing_them_brings_nothing_else():
     code = """
 import sys
-import jaxpose.fields, jaxpose.motion, jaxpose.render, jaxpose.losses, jaxpose.imu
+import jaxpose.fields, jaxpose.fields.derivatives, jaxpose.render, jaxpose.losses, jaxpose.imu
 parts = ("slam", "data", "experiments", "plots", "io", "recording", "scenes", "metrics")
 others = [f"jaxpose.{part}" for part in parts] + ["matplotlib", "imageio", "PIL", "tyro", "tqdm", "evo"]
 print([name for name in others if name in sys.modules])

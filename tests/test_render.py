@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from jaxpose import render, se3
+from jaxpose import render
+from jaxpose.geometry import se3
 from jaxpose.render import (
     Ray,
     composite,

@@ -1,6 +1,6 @@
 """`python -m jaxpose` is `jaxpose`."""
 
-from jaxpose.cli import main
+from jaxpose.cli.main import main
 
 if __name__ == "__main__":
     main()

@@ -11,11 +11,11 @@ from typing import Annotated
 
 import tyro
 
-from jaxpose import command
-from jaxpose.experiments import slam_run
-from jaxpose.experiments.slam_options import Options
-from jaxpose.experiments.slam_report import progress_bar, report
-from jaxpose.slam.run import SlamConfig
+from jaxpose.experiments import command
+from jaxpose.experiments.slam import pipeline as slam_pipeline
+from jaxpose.experiments.slam.options import Options
+from jaxpose.experiments.slam.report import progress_bar, report
+from jaxpose.slam.pipeline import SlamConfig
 
 
 @dataclass(frozen=True)
@@ -25,9 +25,9 @@ class Config(Options):
     slam: Annotated[SlamConfig, tyro.conf.arg(name="")] = SlamConfig(imu="none")
 
 
-def run(config: Config, on_frame: slam_run.OnFrame | None = None) -> slam_run.Outcome:
+def run(config: Config, on_frame: slam_pipeline.OnFrame | None = None) -> slam_pipeline.Outcome:
     """Track the recording that `config` names, and write its run folder; see `slam_run.run`."""
-    return slam_run.run("rgbd_slam", config, on_frame)
+    return slam_pipeline.run("rgbd_slam", config, on_frame)
 
 
 def main(args: Sequence[str] | None = None) -> None:

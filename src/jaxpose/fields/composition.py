@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxpose import se3
-from jaxpose.fields.base import PoseField, PoseFn
+from jaxpose.fields.types import PoseField, PoseFn
+from jaxpose.geometry import se3
 
 
 def refine(field: PoseField, initial: PoseFn, *, side: Literal["body", "world"] = "body") -> PoseField:

@@ -5,9 +5,9 @@ from typing import Literal
 
 from jaxpose.fields import PoseNetConfig
 from jaxpose.imu import ADIS16448, ImuNoise
-from jaxpose.slam.frames import FrameName
-from jaxpose.slam.mapping import MapConfig
-from jaxpose.slam.objective import ImuWeights, TrackConfig
+from jaxpose.slam.map.photometric import MapConfig
+from jaxpose.slam.tracking.objective import ImuWeights, TrackConfig
+from jaxpose.slam.tracking.reference_frames import FrameName
 
 ImuMode = Literal["none", "loose", "tight", "accelerometer", "combined"]
 

@@ -6,9 +6,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxpose.camera import Camera
-from jaxpose.recording import Frame, Recording
-from jaxpose.slam.observe import Image, to_device
+from jaxpose.datasets.types import Frame, Recording
+from jaxpose.geometry.camera import Camera
+from jaxpose.slam.observation import Image, to_device
 
 
 class Keyframe(NamedTuple):

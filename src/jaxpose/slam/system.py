@@ -8,18 +8,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxpose import imu as inertial
-from jaxpose.camera import angle_of_view
+from jaxpose.datasets.types import Recording
 from jaxpose.errors import DataError
+from jaxpose.geometry.camera import angle_of_view
 from jaxpose.imu import ResidualSigmas
-from jaxpose.recording import Recording
 from jaxpose.scenes import GridConfig
 from jaxpose.slam.config import IMU_WEIGHTS, SlamConfig
-from jaxpose.slam.frames import Framed, make_field
 from jaxpose.slam.keyframes import look
-from jaxpose.slam.predict import Readings, integrate, no_readings
-from jaxpose.slam.reframe import Refit, make_refit
-from jaxpose.slam.track import make_settle
-from jaxpose.slam.world import World, make_world
+from jaxpose.slam.map.world import World, make_world
+from jaxpose.slam.tracking.intrinsic_frame import Refit, make_refit
+from jaxpose.slam.tracking.predict import Readings, integrate, no_readings
+from jaxpose.slam.tracking.reference_frames import Framed, make_field
+from jaxpose.slam.tracking.steps import make_settle
 
 # How well a PoseNet over a few frames follows a hand's motion between them: added to the sensor's own noise.
 FIELD_SIGMAS = ResidualSigmas(loose=0.004, tight=0.1, accelerometer=1.0)

@@ -1,0 +1,113 @@
+"""What a set of data is, and what is wrong with it: stamps, poses, camera, depth, IMU, and how they agree.
+
+DATA is a folder of an RGB-D recording (7-Scenes, TUM, Replica, ScanNet, EuRoC, plain), of photographs with
+poses (Blender, nerfstudio, LLFF), of an IMU with truth (EuRoC), or of events (DAVIS text, EventNeRF, npz,
+DSEC's HDF5); a trajectory file (TUM, KITTI, EuRoC, 4x4), or a folder of such files. The format is found by
+the files. Ends with 0 if no fault is found, with 2 for warnings, and with 1 for data that cannot be used.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import tyro
+
+from jaxpose.cli.check.findings import Checked, Fact, Finding
+from jaxpose.errors import DataError
+
+_KNOWN = (
+    "an RGB-D recording (7-Scenes, TUM, Replica, ScanNet, EuRoC, or color/ and depth/ with intrinsics), "
+    "photographs (transforms.json, transforms_train.json or poses_bounds.npy), mav0/imu0 with truth, "
+    "events (events*.txt, *.npz, *.h5, or EventNeRF's folders), or trajectories"
+)
+
+
+@dataclass(frozen=True)
+class Config:
+    """What to check."""
+
+    data: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")]  # folder, or trajectory file
+    json: bool = False  # print all that was found as JSON and nothing else
+
+
+class Result(NamedTuple):
+    """What the data are, what was measured, and the outcome of every test."""
+
+    path: Path
+    format: str
+    facts: tuple[Fact, ...]
+    findings: tuple[Finding, ...]
+    notes: tuple[str, ...]  # what loaders skipped or assumed, and what could not be tested
+
+
+def run(config: Config) -> Result:
+    """Find the format of the data and test them; DataError or OSError for what has no format known here."""
+    path = config.data
+    if path.is_file() and path.suffix not in (".json", ".npz", ".h5", ".hdf5"):
+        from jaxpose.cli.check.trajectory import check_trajectory
+
+        form, checked = check_trajectory(path)
+        return Result(path, f"{form} trajectory", *checked)
+    if not path.exists():
+        raise DataError(f"{path}: expected {_KNOWN}, got nothing")
+    form, checked = _folder(path)
+    return Result(path, form, *checked)
+
+
+def report(result: Result) -> str:
+    """What was found, a line each, warnings and errors last."""
+    width = max(10, *(len(name) for name, *_ in result.facts), *(len(f.test) for f in result.findings)) + 9
+    lines = [("format", f"{result.path}  {result.format}")]
+    lines += [(fact.name, fact.text) for fact in result.facts]
+    lines += [("note", note) for note in result.notes]
+    ranked = sorted(result.findings, key=lambda f: ("ok", "warning", "error").index(f.severity))
+    lines += [(f"{finding.severity:<8} {finding.test}", str(finding)) for finding in ranked]
+    told = [f"  {name:<{width}} {text}" for name, text in lines]
+    return "\n".join([*told, "", f"  {_verdict(result)}"])
+
+
+def exit_code(result: Result) -> int:
+    """0: no fault found; 2: warnings; 1: unusable."""
+    severities = {finding.severity for finding in result.findings}
+    return 1 if "error" in severities else 2 if "warning" in severities else 0
+
+
+def _verdict(result: Result) -> str:
+    counts = {s: sum(finding.severity == s for finding in result.findings) for s in ("error", "warning")}
+    if counts["error"]:
+        return "unusable as it is"
+    plural = "s" if counts["warning"] > 1 else ""
+    return f"{counts['warning']} warning{plural}" if counts["warning"] else "no fault found"
+
+
+def _folder(path: Path) -> tuple[str, Checked]:
+    """The format of a folder (or json file), in words, and what is found in it."""
+    # Here, as the loaders load jax, which --help does without.
+    from jaxpose.cli.check import events as check_events
+    from jaxpose.cli.check import inertial as check_inertial
+    from jaxpose.cli.check import photographs as check_photographs
+    from jaxpose.cli.check import recording as check_recording
+    from jaxpose.cli.check.trajectory import check_trajectories
+    from jaxpose.datasets.images import found
+    from jaxpose.datasets.rgbd import euroc
+    from jaxpose.datasets.rgbd import registry as rgbd_registry
+
+    transforms = [path, path / "transforms_train.json", path / "transforms.json"]
+    file = next((file for file in transforms if file.is_file()), None)
+    if events := check_events.find_events(path):
+        return check_events.check_events(path, events)
+    if file is not None and not (path / "color").is_dir():
+        name = "Blender" if file.name == "transforms_train.json" else "nerfstudio, instant-ngp"
+        return f"photographs, {name} ({file.name})", check_photographs.check_photographs(path, "blender")
+    if (path / "poses_bounds.npy").is_file():
+        return "photographs, LLFF (poses_bounds.npy)", check_photographs.check_photographs(path, "llff")
+    if euroc.is_here(path) and not check_inertial.has_depth(path):
+        return "EuRoC, IMU and truth without depth", check_inertial.check_inertial(path)
+    try:
+        form = rgbd_registry.find_format(path)
+    except DataError:
+        checked: Checked | None = check_trajectories(path)
+        if checked is None:
+            raise DataError(f"{path}: expected {_KNOWN}, got {found(path)}") from None
+        return "folder of trajectories", checked
+    return f"RGB-D recording ({form})", check_recording.check_recording(path, form)

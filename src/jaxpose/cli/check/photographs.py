@@ -1,0 +1,86 @@
+"""Checks of photographs with poses: the camera, and whether the cameras look where others look."""
+
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxpose.cli.check.findings import Checked, Fact, Finding, join, unusable
+from jaxpose.cli.check.poses import check_poses
+from jaxpose.cli.check.recording import check_camera
+from jaxpose.datasets.images import SUFFIXES, image_size
+from jaxpose.datasets.photos import blender, llff
+from jaxpose.datasets.photos.common import OPENGL
+from jaxpose.datasets.types import Photographs
+from jaxpose.errors import DataError
+
+_WIDTH = 8  # pixels: the images are decoded to see that they can be, and not kept
+_PARALLEL = 1e-2  # least share of the directions across the axes; less has no point in common
+_MEET = 0.3  # distance of an axis from the common point, over the distance to it
+
+
+def check_photographs(path: Path, layout: Literal["blender", "llff"]) -> Checked:
+    """Count, camera, extent and notes of photographs in one of the two layouts; where the cameras look."""
+    try:
+        held = (blender if layout == "blender" else llff).load(path, width=_WIDTH)
+    except (DataError, OSError) as error:
+        return unusable(error)
+    train = held[0]
+    T = np.concatenate([part.T_world_cam for part in held])
+    folder = path.parent if path.is_file() else path
+    text = f"{len(held[0].t)}, and {len(held[1].t)} held out"
+    fact = Fact("photographs", text, {"count": len(T), "held_out": len(held[1].t)})
+    depths = f"from {train.near:.3g} to {train.far:.3g}, equal steps in {train.spacing}"
+    reach = Fact("scene depths", depths, {"near": train.near, "far": train.far})
+    parts = [Checked((fact, reach)), _camera(folder, train), check_poses(None, T), _look(T)]
+    return join([*parts, Checked(notes=train.notes)])
+
+
+def _camera(folder: Path, photographs: Photographs) -> Checked:
+    """The camera of the images as they are on disk."""
+    from jaxpose.geometry.camera import resized
+
+    name = photographs.files[0]
+    files = (folder / name, *(folder / f"{name}{suffix}" for suffix in SUFFIXES))
+    return check_camera(resized(photographs.camera, *image_size(next(f for f in files if f.is_file()))))
+
+
+def _look(T: Float[np.ndarray, "n 4 4"]) -> Checked:
+    """Where the optical axes come closest to each other, under the usual conventions.
+
+    Photographs of one object or place, seen from around or from one side: it lies in front of the cameras.
+    """
+    test, expected = "viewing directions", "cameras that look at a common place"
+    front, apart = _common_point(T)
+    if apart > _MEET:
+        # The loader turned the axes of what it took for camera-to-world: first back to the file's.
+        turned_front, turned_apart = _common_point(np.linalg.inv(T @ OPENGL) @ OPENGL)
+        if turned_apart < _MEET and turned_apart < apart / 3:
+            axes = "" if turned_front > 0.5 else ", in OpenCV axes"
+            found = f"optical axes that do not meet, but do with world-to-camera poses{axes}"
+            return Checked((), (Finding("warning", test, found, expected, "invert the poses"),))
+        return Checked(notes=("the optical axes meet nowhere: the poses' convention is not tested",))
+    if front < 0.5:
+        found = f"one that lies behind {1 - front:.0%} of them: they look outward, or their axes are flipped"
+        fix = "if they do not look outward, turn the camera axes (OpenCV for OpenGL: y and z change sign)"
+        return Checked((), (Finding("warning", test, found, expected, fix),))
+    found = f"the point where the optical axes meet lies in front of {front:.0%} of the cameras"
+    return Checked((), (Finding("ok", test, found),))
+
+
+def _common_point(T: Float[np.ndarray, "n 4 4"]) -> tuple[float, float]:
+    """Share of the cameras that have the point nearest to all axes in front, and how far axes miss it.
+
+    As a share of the distance to it; infinity for axes that are all but parallel.
+    """
+    axes, centres = T[:, :3, 2], T[:, :3, 3]
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    total = across.mean(0)
+    if np.linalg.eigvalsh(total)[0] < _PARALLEL:
+        return 0.0, np.inf
+    point = np.linalg.solve(total, np.einsum("nij,nj->i", across, centres) / len(T))
+    to = point - centres
+    missed = np.linalg.norm(np.einsum("nij,nj->ni", across, to), axis=1)
+    apart = float(np.median(missed) / max(float(np.median(np.linalg.norm(to, axis=1))), 1e-12))
+    return float((np.einsum("ni,ni->n", to, axes) > 0).mean()), apart

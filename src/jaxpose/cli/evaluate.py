@@ -1,0 +1,249 @@
+"""How far an estimated trajectory is from a reference: ATE, RPE and rotation error, with their protocol.
+
+ESTIMATE and REFERENCE are trajectory files (TUM, KITTI, EuRoC or TUM-VI csv, lists of 4x4 matrices: found by
+their content) or run folders of this package. Poses are paired by nearest stamp, or row by row where a format
+has no stamps; a run's continuous trajectory is asked at the reference's own stamps.
+"""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal, NamedTuple
+
+import numpy as np
+import tyro
+from jaxtyping import Float
+
+from jaxpose.cli.source import FIELD, Source, read_field, read_source
+from jaxpose.errors import DataError
+from jaxpose.evaluation import trajectory_error
+from jaxpose.evaluation.trajectory_error import Alignment, Statistics
+from jaxpose.experiments.command import markdown_table
+from jaxpose.files import trajectories
+from jaxpose.geometry import rigid
+from jaxpose.geometry.rigid import Similarity
+
+Unit = Literal["frames", "s", "m"]
+_ALIGNMENTS = {
+    "none": "none: poses are compared as they are",
+    "se3": "SE(3): rotation and translation, least squares of the positions (Umeyama)",
+    "sim3": "Sim(3): rotation, translation and scale, least squares of the positions (Umeyama)",
+}
+
+
+@dataclass(frozen=True)
+class Config:
+    """Settings of a comparison; the two trajectories and these are all that the numbers depend on."""
+
+    estimate: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="ESTIMATE")]  # file or run folder
+    # The truth, or what is taken for it: file or run folder.
+    reference: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="REFERENCE")]
+    align: Alignment = "se3"  # how the estimate is moved onto the reference first
+    # nearest: each pose of the shorter trajectory with the nearest in time of the other; exact: the
+    # continuous trajectory of the estimate at the reference's stamps; auto: exact if the estimate is a run
+    # that has one.
+    match: Literal["auto", "nearest", "exact"] = "auto"
+    max_difference: float = 0.01  # [s] largest distance of two stamps that are paired as nearest
+    time_offset: float = 0.0  # [s] added to the stamps of the estimate
+    rpe_frames: tuple[int, ...] = (1,)  # relative errors over so many poses
+    rpe_seconds: tuple[float, ...] = (1.0,)  # relative errors over so much time [s]
+    rpe_metres: tuple[float, ...] = ()  # relative errors over so much of the reference's path [m]
+    plot: Path | None = None  # PNG to draw both trajectories and the errors in
+    json: bool = False  # print the numbers as JSON and nothing else
+
+    def __post_init__(self):
+        if not 0 <= self.max_difference < math.inf:
+            raise ValueError(f"--max-difference: expected 0 or more, got {self.max_difference}")
+        if self.plot is not None and self.plot.suffix != ".png":
+            raise ValueError(f"--plot: expected a name that ends in .png, got {self.plot}")
+        if not math.isfinite(self.time_offset):
+            raise ValueError(f"--time-offset: expected a finite number, got {self.time_offset}")
+        for option in ("rpe_frames", "rpe_seconds", "rpe_metres"):
+            for delta in getattr(self, option):
+                if not 0 < delta < math.inf:
+                    raise ValueError(f"--{option.replace('_', '-')}: expected positive numbers, got {delta}")
+
+
+class Relative(NamedTuple):
+    """Relative errors over one distance."""
+
+    delta: float
+    unit: Unit
+    translation_m: Statistics
+    rotation_deg: Statistics
+    pairs: int
+
+
+class Result(NamedTuple):
+    """The errors of a comparison, and how they were measured."""
+
+    estimate: str  # in words
+    reference: str
+    pairs: int
+    association: str
+    alignment: Alignment
+    transform: Similarity  # estimate -> reference
+    ate_m: Statistics
+    rotation_deg: Statistics
+    rpe: tuple[Relative, ...]
+    notes: tuple[str, ...]
+    plot: Path | None
+
+
+class _Pairs(NamedTuple):
+    """Poses row by row, at the reference's stamps."""
+
+    t: Float[np.ndarray, " n"]
+    estimate: Float[np.ndarray, "n 4 4"]
+    reference: Float[np.ndarray, "n 4 4"]
+    how: str
+    stamped: bool
+
+
+def run(config: Config) -> Result:
+    """Compare the trajectories that the config names, and draw them if it says so.
+
+    Raises DataError or OSError for what cannot be used.
+    """
+    estimate, reference = read_source(config.estimate), read_source(config.reference)
+    pairs = _pair(config, estimate, reference)
+    ate = trajectory_error.ate(pairs.estimate, pairs.reference, config.align)
+    aligned = trajectory_error.align(ate.alignment, pairs.estimate)
+    turned = rigid.rotation_angle_deg(aligned[:, :3, :3], pairs.reference[:, :3, :3])
+    rpe, notes = _relative(config, pairs)
+    if config.plot is not None:
+        from jaxpose.plots.evaluation import comparison
+
+        comparison(
+            config.plot,
+            pairs.t if pairs.stamped else None,
+            aligned,
+            pairs.reference,
+            ate.errors,
+            turned,
+            f"{config.estimate.name} against {config.reference.name}: ATE-RMSE {ate.rmse:.4g} m, "
+            f"alignment {config.align}, {len(pairs.t)} pairs",
+        )
+    return Result(
+        estimate=str(estimate),
+        reference=str(reference),
+        pairs=len(pairs.t),
+        association=pairs.how,
+        alignment=config.align,
+        transform=ate.alignment,
+        ate_m=trajectory_error.statistics(ate.errors),
+        rotation_deg=trajectory_error.statistics(turned),
+        rpe=rpe,
+        notes=notes,
+        plot=config.plot,
+    )
+
+
+def report(result: Result) -> str:
+    """The numbers as a table under their protocol."""
+    scale = f", scale {result.transform.scale:.6g}" if result.alignment == "sim3" else ""
+    lines = [
+        _line("estimate", result.estimate),
+        _line("reference", result.reference),
+        _line("pairs", f"{result.pairs} {result.association}"),
+        _line("alignment", _ALIGNMENTS[result.alignment] + scale),
+        "",
+        markdown_table([
+            ("error", "unit", "RMSE", "mean", "median", "max"),
+            _row("ATE", "m", result.ate_m),
+            _row("rotation", "deg", result.rotation_deg),
+            *(
+                _row(f"RPE over {_distance(rpe.delta, rpe.unit)}", unit, statistics)
+                for rpe in result.rpe
+                for unit, statistics in (("m", rpe.translation_m), ("deg", rpe.rotation_deg))
+            ),
+        ]),
+        "",
+        "  ATE: distance of positions after alignment; rotation: angle between orientations after it;",
+        "  RPE: error of the motion between two poses so far apart (s, m: within a tenth), all such pairs",
+    ]  # fmt: skip
+    lines += [_line("note", note) for note in result.notes]
+    if result.plot is not None:
+        lines.append(_line("drawn in", str(result.plot)))
+    return "\n".join(lines)
+
+
+def _pair(config: Config, estimate: Source, reference: Source) -> _Pairs:
+    """Poses of the two for each other."""
+    match = config.match
+    if match == "auto":
+        match = "exact" if (config.estimate / FIELD).is_file() and reference.stamped else "nearest"
+    (t_estimate, T_estimate), (t_reference, T_reference) = estimate.trajectory, reference.trajectory
+    if match == "exact":
+        return _exact(config, estimate, reference)
+    if not (estimate.stamped and reference.stamped):
+        if len(t_estimate) != len(t_reference):
+            raise DataError(
+                f"{estimate.path}: expected {len(t_reference)} poses, as {reference.path} has, to pair them "
+                f"row by row (one of the two has no stamps), got {len(t_estimate)}"
+            )
+        t = t_reference if reference.stamped else t_estimate + config.time_offset
+        stamped = reference.stamped or estimate.stamped
+        return _Pairs(t, T_estimate, T_reference, "row by row, as not both have stamps", stamped)
+    # Reference first: of two equally long ones each pose of the estimate takes its nearest, as evo does.
+    of_reference, of_estimate = trajectories.associate(
+        t_reference, t_estimate + config.time_offset, config.max_difference
+    )
+    fewer = min(len(t_reference), len(t_estimate))
+    how = f"of {fewer} poses of the shorter one: nearest stamps, at most {config.max_difference:g} s apart"
+    how += f"; the estimate's moved by {config.time_offset:g} s" if config.time_offset else ""
+    return _Pairs(t_reference[of_reference], T_estimate[of_estimate], T_reference[of_reference], how, True)
+
+
+def _exact(config: Config, estimate: Source, reference: Source) -> _Pairs:
+    """The estimate's continuous trajectory at the reference's stamps, as far as it goes."""
+    pose = read_field(estimate)
+    if not reference.stamped:
+        raise DataError(f"{reference.path}: expected stamps for --match exact, got a {reference.what}")
+    first, last = estimate.trajectory.t[[0, -1]]
+    t = reference.trajectory.t - config.time_offset
+    inside = (t >= first) & (t <= last)
+    if not inside.any():
+        raise DataError(
+            f"{reference.path}: expected stamps from {first:.3f} to {last:.3f} s, as {estimate.path} has, "
+            f"got {t[0]:.3f} to {t[-1]:.3f} s; --time-offset brings them to one clock"
+        )
+    outside = len(t) - int(inside.sum())
+    how = f"exact: the continuous trajectory ({FIELD}) at the reference's stamps"
+    how += f"; {outside} stamps of the reference beyond its ends are left out" if outside else ""
+    how += f"; the estimate's clock moved by {config.time_offset:g} s" if config.time_offset else ""
+    return _Pairs(reference.trajectory.t[inside], pose(t[inside]), reference.trajectory.T[inside], how, True)
+
+
+def _relative(config: Config, pairs: _Pairs) -> tuple[tuple[Relative, ...], tuple[str, ...]]:
+    """Relative errors over all distances asked for, and notes on those that are not to be had."""
+    along = {"s": pairs.t - pairs.t[0], "m": trajectory_error.path_length(pairs.reference)}
+    asked: list[tuple[Unit, float]] = [("frames", delta) for delta in config.rpe_frames]
+    asked.extend(("s", delta) for delta in config.rpe_seconds if pairs.stamped)
+    asked.extend(("m", delta) for delta in config.rpe_metres)
+    found, notes = [], []
+    if config.rpe_seconds and not pairs.stamped:
+        notes.append("no stamps, so no RPE over seconds")
+    for unit, delta in asked:
+        try:
+            rpe = trajectory_error.rpe(
+                pairs.estimate, pairs.reference, delta, config.align, along=along.get(unit)
+            )
+        except DataError:
+            notes.append(f"RPE over {_distance(delta, unit)}: no two poses are that far apart, to a tenth")
+        else:
+            found.append(Relative(float(delta), unit, rpe.translation_m, rpe.rotation_deg, rpe.pairs))
+    return tuple(found), tuple(notes)
+
+
+def _distance(delta: float, unit: Unit) -> str:
+    return f"{delta:g} {'frame' if unit == 'frames' and delta == 1 else unit}"
+
+
+def _row(name: str, unit: str, statistics: Statistics) -> tuple[str, ...]:
+    values = (statistics.rmse, statistics.mean, statistics.median, statistics.max)
+    return (name, unit, *(f"{value:.6f}" for value in values))
+
+
+def _line(name: str, text: str) -> str:
+    return f"  {name:<10} {text}"

@@ -1,0 +1,234 @@
+"""Which pose field carries a motion: several fitted to stamped poses, and what is left of each.
+
+TRAJECTORY is a file of stamped poses (TUM, KITTI, EuRoC or TUM-VI csv, 4x4 lists: found by its content) or a
+run folder. Every tenth pose is held out. With --imu the fields' own derivatives, which have seen poses only,
+are compared with a gyroscope and an accelerometer.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import numpy as np
+import tyro
+from jaxtyping import Float
+
+from jaxpose.cli.source import read_source
+from jaxpose.errors import DataError
+from jaxpose.evaluation.trajectory_error import Statistics
+from jaxpose.experiments.command import check_least, markdown_table
+from jaxpose.files.trajectories import Trajectory
+from jaxpose.geometry.rigid import Similarity
+
+FEWEST = 20  # poses, inertial readings
+_SLOW = 3.0  # times the best field's error
+
+
+@dataclass(frozen=True)
+class Config:
+    """Settings of the comparison; the trajectory and these are all that the numbers depend on."""
+
+    trajectory: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="TRAJECTORY")]  # or a run folder
+    # Folder in the EuRoC layout whose mav0/imu0 was read by the same clock, in the same body, as the poses.
+    imu: Path | None = None
+    rate_hz: float | None = None  # of the poses of a format without stamps
+    posenet_octaves: tuple[int, ...] = (5, 8)  # PoseNets to fit, by the octaves of their time encoding
+    posenet_layers: int = 8
+    posenet_width: int = 256
+    bspline_hz: tuple[float, ...] = (2.0, 5.0, 10.0, 20.0)  # B-splines to fit, by their knots a second
+    steps: int = 1000  # of Adam, for each field
+    seed: int = 0  # of the networks' start
+    out: Path | None = None  # write the field that fits best: npz that jaxpose/numpy_field.py reads
+    json: bool = False  # print the numbers as JSON and nothing else
+
+    def __post_init__(self):
+        if not self.posenet_octaves and not self.bspline_hz:
+            raise ValueError("--bspline-hz: expected a field to fit, PoseNet or B-spline, got none")
+        check_least(self, posenet_octaves=0, posenet_layers=1, posenet_width=1, steps=1)
+        for option in ("bspline_hz", "rate_hz"):
+            values = getattr(self, option)
+            for value in values if isinstance(values, tuple) else (values,):
+                if value is not None and not 0 < value < np.inf:
+                    raise ValueError(f"--{option.replace('_', '-')}: expected positive numbers, got {value}")
+
+
+class Inertial(NamedTuple):
+    """How far a field's derivatives are from readings, after constant biases and gravity are fitted."""
+
+    omega_rms: float  # rad/s, per axis
+    acceleration_rms: float  # m/s^2, per axis
+    gyro_bias: Float[np.ndarray, "3"]
+    gravity_world: Float[np.ndarray, "3"]  # m/s^2, in the trajectory's world
+    samples: int
+
+
+class Fitted(NamedTuple):
+    """A field and what is left of the poses that it has not seen."""
+
+    name: str
+    highest_hz: float
+    parameters: int
+    seconds: float
+    translation_m: Statistics
+    rotation_deg: Statistics
+    inertial: Inertial | None
+
+
+class Sensor(NamedTuple):
+    """What an IMU's readings are worth, one sigma a reading: by its data sheet, and by themselves."""
+
+    readings: int
+    rate_hz: float
+    stated: tuple[float, float]  # rad/s, m/s^2
+    measured: tuple[float, float]  # RMS of second differences / sqrt 6: sensor and vibration
+
+
+class Result(NamedTuple):
+    """The fields, and how they were measured."""
+
+    source: str
+    poses: int
+    held_out: int
+    span_s: float
+    rate_hz: float
+    bandwidth_hz: float  # below it lies 95% of the power of the speeds
+    sensor: Sensor | None
+    fields: tuple[Fitted, ...]
+    best: str  # least median error of position (in half the extent) and orientation [rad] together
+    too_slow: tuple[str, ...]  # do not reach the bandwidth, and leave three times what the best leaves
+    notes: tuple[str, ...]
+
+
+def run(config: Config, on_field: Callable[[str], None] | None = None) -> Result:
+    """Fit every field that the config names; `on_field` is told the name of each before its turn.
+
+    Raises DataError or OSError for what cannot be used.
+    """
+    from jaxpose.cli.fit import candidates as fit_candidates
+    from jaxpose.fields.serialization import write_field
+
+    source, trajectory = _trajectory(config)
+    imu, sensor, notes = (None, None, ())
+    if config.imu is not None:
+        imu, sensor, notes = fit_candidates.readings(config.imu, trajectory)
+    span_s = float(trajectory.t[-1] - trajectory.t[0])
+    rate_hz = 1 / float(np.median(np.diff(trajectory.t)))
+    held = np.arange(len(trajectory.t)) % 10 == 5
+    candidates = [
+        fit_candidates.posenet(span_s, octaves, config.posenet_layers, config.posenet_width, config.seed)
+        for octaves in config.posenet_octaves
+    ]
+    for knots_hz in config.bspline_hz:
+        if knots_hz <= rate_hz / 2:
+            candidates.append(fit_candidates.bspline(span_s, knots_hz))
+        else:
+            notes += (
+                f"no B-spline of {knots_hz:g} knots/s: fewer than two poses for each ({rate_hz:.3g} Hz)",
+            )
+    if not candidates:
+        raise DataError(f"{source}: expected more poses for these B-splines, got {rate_hz:.3g} Hz")
+    around = fit_candidates.frame(trajectory)
+    fitted, factors = [], []
+    for candidate in candidates:
+        if on_field is not None:
+            on_field(candidate.name)
+        field, factor = fit_candidates.fit_field(candidate, trajectory, held, around, imu, config.steps)
+        fitted.append(field)
+        factors.append(factor)
+    off = np.array(
+        [f.translation_m.median / around.scale + np.radians(f.rotation_deg.median) for f in fitted]
+    )
+    best = int(np.argmin(off))
+    bandwidth_hz = fit_candidates.bandwidth_hz(trajectory)
+    slow = [f.highest_hz < bandwidth_hz and x > _SLOW * off.min() for f, x in zip(fitted, off, strict=True)]
+    if config.out is not None:
+        config.out.parent.mkdir(parents=True, exist_ok=True)
+        moved = Similarity(around.scale, np.eye(3), around.middle)
+        span = (float(trajectory.t[0]), float(trajectory.t[-1]))
+        write_field(config.out, span, [factors[best]], alignment=moved)
+        notes += (f"{fitted[best].name} written to {config.out}, seconds as in {config.trajectory.name}",)
+    return Result(
+        source,
+        len(held),
+        int(held.sum()),
+        span_s,
+        rate_hz,
+        bandwidth_hz,
+        sensor,
+        tuple(fitted),
+        fitted[best].name,
+        tuple(f.name for f, is_slow in zip(fitted, slow, strict=True) if is_slow),
+        notes,
+    )
+
+
+def report(result: Result) -> str:
+    """The fields side by side, and how they were measured."""
+    sensor = result.sensor
+    head = ["field", "up to [Hz]", "parameters", "position [mm]", "rotation [deg]"]
+    if sensor is not None:
+        head += ["body rate [rad/s]", "acceleration [m/s^2]"]
+    rows = [[*head, "fit [s]", ""]]
+    for field in result.fields:
+        row = [field.name, f"{field.highest_hz:.3g}", f"{field.parameters}"]
+        for statistics, factor in ((field.translation_m, 1e3), (field.rotation_deg, 1.0)):
+            row.append(f"{factor * statistics.median:.3g} (rmse {factor * statistics.rmse:.3g})")
+        if sensor is not None and field.inertial is not None:
+            left = (field.inertial.omega_rms, field.inertial.acceleration_rms)
+            row += [f"{x:.3g} ({x / s:.3g}x)" for x, s in zip(left, sensor.stated, strict=True)]
+        verdict = " ".join(
+            word
+            for word, holds in (
+                ("best", field.name == result.best),
+                ("too slow", field.name in result.too_slow),
+            )
+            if holds
+        )
+        rows.append([*row, f"{field.seconds:.1f}", verdict])
+    lines = [
+        ("poses", f"{result.source}: {result.rate_hz:.4g} Hz over {result.span_s:.4g} s"),
+        (
+            "motion",
+            f"95% of the power of velocity and body rate lies below {result.bandwidth_hz:.3g} Hz; a field is "
+            "too slow whose fastest band (PoseNet) or half of whose knots a second (B-spline) do not reach "
+            f"that, and which leaves {_SLOW:g} times what the best leaves",
+        ),
+        (
+            "residuals",
+            f"median over {result.held_out} of {result.poses} poses, every tenth, that no field has seen",
+        ),
+    ]
+    if sensor is not None:
+        omega, acceleration = sensor.measured
+        lines += [
+            (
+                "inertial",
+                f"RMS per axis over {sensor.readings} readings at {sensor.rate_hz:.4g} Hz, constant biases "
+                "and gravity fitted; in brackets times the data sheet's sigma, "
+                f"{sensor.stated[0]:.3g} rad/s and {sensor.stated[1]:.3g} m/s^2",
+            ),
+            (
+                "readings",
+                f"differ from their neighbours as if their own noise were {omega:.3g} rad/s and "
+                f"{acceleration:.3g} m/s^2 (RMS of second differences / sqrt 6: sensor and vibration)",
+            ),
+        ]
+    lines += [("note", note) for note in result.notes]
+    told = "\n".join(f"  {name:<10} {text}" for name, text in lines)
+    return f"{markdown_table(rows)}\n\n{told}"
+
+
+def _trajectory(config: Config) -> tuple[str, Trajectory]:
+    """The poses with their stamps, and what they are in words."""
+    source = read_source(config.trajectory)
+    trajectory = source.trajectory
+    if not source.stamped:
+        if config.rate_hz is None:
+            raise DataError(f"{source.path}: expected --rate-hz, as a {source.what} has no stamps, got none")
+        trajectory = trajectory._replace(t=trajectory.t / config.rate_hz)
+    elif config.rate_hz is not None:
+        raise DataError(f"{source.path}: expected no --rate-hz, as a {source.what} has stamps")
+    if len(trajectory.t) < FEWEST:
+        raise DataError(f"{source.path}: expected at least {FEWEST} poses to fit, got {len(trajectory.t)}")
+    return str(source), trajectory

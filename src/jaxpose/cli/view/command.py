@@ -1,0 +1,87 @@
+"""Look at a run in the browser: its path and the truth, cameras with their pictures, map, renders over time.
+
+RUN is a run folder, or a trajectory file. A slider moves a camera along the run's continuous trajectory and
+shows what the run's map or radiance field shows from there. Nothing is loaded from the network. --save writes
+the scene as one HTML file, the camera on its way in it, which opens in any browser without this program.
+"""
+
+import sys
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import tyro
+
+from jaxpose.cli.view.scene import read_scene
+from jaxpose.errors import DataError
+
+
+@dataclass(frozen=True)
+class Config:
+    """What to show, and where."""
+
+    run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]  # folder, or trajectory file
+    port: int = 8080  # of the page; the next free one if it is taken
+    host: str = "127.0.0.1"  # who may see it: this machine alone; 0.0.0.0: everyone who reaches it
+    frustums: int = 30  # so many frames, evenly over the run, are shown as cameras with their pictures
+    save: Path | None = None  # HTML file to write instead
+
+    def __post_init__(self):
+        if not 0 <= self.port < 65536:
+            raise ValueError(f"--port: expected 0 (any) to 65535, got {self.port}")
+        if self.frustums < 0:
+            raise ValueError(f"--frustums: expected 0 or more, got {self.frustums}")
+        if self.save is not None and self.save.suffix != ".html":
+            raise ValueError(f"--save: expected a name that ends in .html, got {self.save}")
+
+
+class Shown(NamedTuple):
+    """Where a run is to be seen, until `close()`."""
+
+    run: str  # in words
+    url: str | None
+    file: Path | None
+    notes: tuple[str, ...]
+    close: Callable[[], None]
+
+
+def run(config: Config) -> Shown:
+    """Show the run until `close()` is called, or write it to a file.
+
+    Raises DataError or OSError for what cannot be used.
+    """
+    try:
+        from jaxpose.cli.view import page as view_page
+    except ImportError:
+        raise DataError('expected viser, got none: pip install "jaxpose[viewer]"') from None
+    scene = read_scene(config.run, config.frustums)
+    if config.save is not None:
+        view_page.save(scene, config.save)
+        return Shown(scene.name, None, config.save, scene.notes, lambda: None)
+    port, close = view_page.serve(scene, config.host, config.port)
+    notes = () if config.port in (0, port) else (f"port {config.port} is taken",)
+    host = "localhost" if config.host in ("127.0.0.1", "0.0.0.0") else config.host
+    return Shown(scene.name, f"http://{host}:{port}", None, (*notes, *scene.notes), close)
+
+
+def report(shown: Shown) -> str:
+    """Where to look."""
+    if shown.file is None:
+        line = f"{shown.url}  {shown.run}; Ctrl-C ends"
+    else:
+        line = f"{shown.file}  {shown.run}; {shown.file.stat().st_size / 1e6:.1f} MB, opens in any browser"
+    return "\n".join([line, *(f"  note  {note}" for note in shown.notes)])
+
+
+def wait(shown: Shown) -> None:
+    """Keep showing until the user interrupts; a file needs no waiting for."""
+    if shown.url is None:
+        return
+    sys.stdout.flush()  # whoever reads it through a pipe waits for the address
+    try:
+        threading.Event().wait()
+    except KeyboardInterrupt:
+        pass
+    shown.close()

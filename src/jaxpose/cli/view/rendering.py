@@ -1,0 +1,65 @@
+"""What the scene of a run shows at a time: the map of a SLAM run, the radiance field of a NeRF."""
+
+import json
+from collections.abc import Callable
+from functools import cache, partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxpose import scenes
+from jaxpose.cli.view.scene import Picture, Poses, Render
+from jaxpose.errors import DataError
+from jaxpose.experiments.event_nerf import pipeline as event_nerf
+from jaxpose.experiments.noisy_nerf import pipeline as noisy_nerf
+from jaxpose.experiments.slam import map_files
+from jaxpose.geometry.camera import Camera, scale
+from jaxpose.slam.map.texture import painted
+from jaxpose.training import photometric
+from jaxpose.training.photometric import TrainConfig
+
+
+def of_map(file: Path, camera: Camera, poses: Poses) -> Render:
+    """The map of a SLAM run from where `poses` is at a time, light grey where it has no surface."""
+    saved = map_files.read_map(file)
+    look = map_files.viewer(painted(scenes.grid(saved.grid), saved.grid), saved.grid, camera)
+    params = (jnp.asarray(saved.values), jax.tree.map(jnp.asarray, saved.paint))
+
+    def render(t: float, width: int) -> Picture:
+        return _picture(look(params, poses(np.array([t]))[0], map_files.every(camera, width))[0])
+
+    return render
+
+
+def of_radiance(folder: Path, first: float) -> Render:
+    """The radiance field of a NeRF run from where its pose field is `t` after `first` [s]."""
+    experiment = json.loads((folder / "results.json").read_text()).get("experiment")
+    if experiment == "event_nerf":
+        loaded = event_nerf.load_run(folder)
+        problem = loaded.problem
+        camera, depths, background = problem.recording.camera, problem.depths, problem.background
+    elif experiment == "noisy_nerf":
+        loaded = noisy_nerf.load_run(folder)
+        camera, depths, background = loaded.problem.train.camera, loaded.setup.depths, None
+    else:
+        raise DataError(f"{folder}: expected a run of noisy_nerf or event_nerf, got {experiment}")
+    setup, state = loaded.setup, loaded.state
+    config = TrainConfig(steps=1, rays=1, samples=setup.train.samples, chunk=64)
+    pose = jax.jit(partial(setup.field.pose, state.pose))
+
+    @cache
+    def image(width: int) -> Callable:
+        small = scale(camera, min(1.0, width / camera.width))
+        return photometric.viewer(setup.scene, small, depths, config, background=background).image
+
+    def render(t: float, width: int) -> Picture:
+        return _picture(image(width)(state.scene, pose(jnp.float32(first + t)))[0])
+
+    return render
+
+
+def _picture(rgb: Float[np.ndarray | jax.Array, "h w 3"]) -> Picture:
+    return np.round(255 * np.clip(np.asarray(rgb), 0, 1)).astype(np.uint8)

@@ -1,5 +1,0 @@
-"""A room made on the fly, for tests and for a first run without data."""
-
-from jaxpose.data.synthetic.walkthrough import RoomConfig, room
-
-__all__ = ["RoomConfig", "room"]

@@ -1,0 +1,170 @@
+"""DAVIS text, as the event camera data set has it: lines of `t x y p`, frames, calibration and truth."""
+
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NoReturn
+
+import numpy as np
+
+from jaxpose.datasets.events.sidecar import Source, load_source, with_camera
+from jaxpose.datasets.events.stream import BLOCK, Block, Stream, Unit
+from jaxpose.datasets.ground_truth import poses_at
+from jaxpose.datasets.images import image_size, only, some
+from jaxpose.datasets.photos.common import extent_depths, read_images
+from jaxpose.datasets.rgbd.tum import Stamped, read_list
+from jaxpose.datasets.types import EventRecording, Photographs
+from jaxpose.errors import DataError
+from jaxpose.events import Mosaic
+from jaxpose.files.trajectories import Trajectory
+
+_COLUMNS = "4 numbers (t x y p)"
+_EXACT_DIGITS = 15  # of a whole number in float64
+
+
+def is_here(path: Path) -> bool:
+    """Whether a folder has a file of events in text."""
+    return any(path.glob("events*.txt"))
+
+
+def load(
+    path: Path | str,
+    *,
+    mosaic: Mosaic = "mono",
+    size: tuple[int, int] | None = None,
+    unit: Unit | None = None,
+    span: tuple[float, float] | None = None,
+) -> EventRecording:
+    """Read the folder `path`: `events.txt`, else the only `events*.txt` (or name the file itself).
+
+    Time 0 is the first event's stamp. `calib.txt` is fx fy cx cy k1 k2 p1 p2 k3; the sensor is as large as
+    the images, else `size` (width, height), else as `event_beside.with_camera` says. `groundtruth.txt` has
+    T_world_cam as `t tx ty tz qx qy qz qw`, given as it is, before and after the events too.
+
+    `frames` are the images of `images.txt` (lines of stamp and file name) during the events, with the one
+    before and the one after; their poses are interpolated, and those without truth around them are left out.
+    Their near and far are a guess from how far the camera moves. What was left out or assumed is told in
+    `notes`; `span`, `unit` and what is refused are those of `event_clean.clean`.
+    """
+    source = find(path, size=size)
+    folder = source.stream.file.parent
+    recording, zero_s = load_source(source, folder / "groundtruth.txt", mosaic=mosaic, unit=unit, span=span)
+    if not (folder / "images.txt").is_file():
+        return recording
+    images = read_list(folder / "images.txt")
+    frames, notes = _frames(folder, images._replace(t=images.t - zero_s), recording)
+    return recording._replace(frames=frames, notes=(*recording.notes, *notes))
+
+
+def find(path: Path | str, *, size: tuple[int, int] | None = None) -> Source:
+    """The file and the camera that `load` reads."""
+    path = Path(path)
+    file = path if path.is_file() else _only_file(path)
+    stream = Stream(file, lambda: _blocks(file), lambda row: f"{file}:{_line_of(file, row)}", "s")
+    listing = file.parent / "images.txt"
+    if not listing.is_file():
+        return with_camera(stream, size)
+    stated = image_size(read_list(listing).files[0])
+    if size and size != stated:
+        raise DataError(f"{listing}: expected images of {size[0]}x{size[1]}, got {stated[0]}x{stated[1]}")
+    return with_camera(stream, stated)
+
+
+def _only_file(folder: Path) -> Path:
+    files = sorted(folder.glob("events*.txt")) if folder.is_dir() else []
+    if folder / "events.txt" in files:
+        return folder / "events.txt"
+    return only(files, folder, "events.txt, or one events*.txt")
+
+
+def _blocks(file: Path) -> Iterator[Block]:
+    with file.open(encoding="utf-8-sig", errors="replace") as lines:
+        kind = _kind(file)
+        while True:
+            try:
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore", UserWarning)  # nothing left to read
+                    table = np.loadtxt(lines, kind, max_rows=BLOCK, ndmin=1)
+            except ValueError as error:
+                _name_line(file, error)
+            yield Block(table["t"], table["x"], table["y"], table["p"])
+            if len(table) < BLOCK:
+                return
+
+
+def _kind(file: Path) -> np.dtype:
+    """Float64 for all but stamps of so many digits that only integers hold them, as ns since 1970 are."""
+    with file.open(encoding="utf-8-sig", errors="replace") as lines:
+        first = next((fields for fields in map(_fields, lines) if fields), ["0"])[0]
+    whole = first.isdecimal() and len(first) > _EXACT_DIGITS
+    return np.dtype([("t", np.int64 if whole else np.float64), *((name, np.float64) for name in "xyp")])
+
+
+def _fields(line: str) -> list[str]:
+    return line.split("#")[0].split()
+
+
+def _line_of(file: Path, row: int) -> int:
+    """The number of the line that has event `row`."""
+    with file.open(encoding="utf-8-sig", errors="replace") as lines:
+        for number, line in enumerate(lines, start=1):
+            if _fields(line):
+                if row == 0:
+                    return number
+                row -= 1
+    raise IndexError(f"{file}: no event {row} more")
+
+
+def _name_line(file: Path, error: ValueError) -> NoReturn:
+    """DataError with the first line that is none of an event's."""
+    with file.open(encoding="utf-8-sig", errors="replace") as lines:
+        for number, line in enumerate(lines, start=1):
+            fields = _fields(line)
+            if fields and len(fields) != 4:
+                raise DataError(f"{file}:{number}: expected {_COLUMNS}, got {len(fields)}")
+            try:
+                [float(field) for field in fields]
+            except ValueError:
+                got = repr(line.strip()[:60])
+                raise DataError(f"{file}:{number}: expected {_COLUMNS}, got {got}") from None
+    raise DataError(f"{file}: expected lines of {_COLUMNS}, got {error}")
+
+
+def _frames(
+    folder: Path, images: Stamped, recording: EventRecording
+) -> tuple[Photographs | None, tuple[str, ...]]:
+    """The images next to and during the events that have a pose, and notes on the others."""
+    t, events = images.t, recording.events.t
+    first = max(int(np.searchsorted(t, events[0], "right")) - 1, 0)
+    near = np.arange(first, min(int(np.searchsorted(t, events[-1])) + 1, len(t)))
+    poses = poses_at(Trajectory(recording.t, recording.T_world_cam), t[near])
+    posed = np.isfinite(poses).all((1, 2))
+    notes = []
+    if len(near) < len(t):
+        notes.append(
+            f"{len(t) - len(near)} of {len(t)} frames left out, not next to or within the events' time"
+        )
+    if not posed.all():
+        names = [images.files[i].name for i in near[~posed]]
+        notes.append(f"{len(names)} frames left out, no true pose around their stamp: {some(names)}")
+    rows = near[posed]
+    if not len(rows):
+        return None, tuple(notes)
+    depths = extent_depths(recording.T_world_cam)
+    notes.append(
+        f"near {depths[0]:.3g} and far {depths[1]:.3g} of the frames are guessed from the cameras' extent"
+    )
+    files = [images.files[i] for i in rows]
+    rgb, _, camera = read_images(files, recording.camera, stated="the size of the first", width=None)
+    frames = Photographs(
+        name=recording.name,
+        camera=camera,
+        t=t[rows],
+        rgb=rgb,
+        T_world_cam=poses[posed],
+        near=depths[0],
+        far=depths[1],
+        spacing="disparity",
+        files=tuple(str(file.relative_to(folder)) for file in files),
+    )
+    return frames, tuple(notes)

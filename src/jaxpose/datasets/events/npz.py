@@ -1,0 +1,115 @@
+"""Events in a numpy archive: arrays x, y, t and p, with optional `poses.txt` and `calib.txt` beside it."""
+
+import zipfile
+import zlib
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxpose.datasets.events.sidecar import Source, load_source, with_camera
+from jaxpose.datasets.events.stream import BLOCK, Block, Stream, Unit
+from jaxpose.datasets.images import only, some
+from jaxpose.datasets.types import EventRecording
+from jaxpose.errors import DataError
+from jaxpose.events import Mosaic
+
+_NAMES = (("t", "x", "y", "p"), ("ts", "xs", "ys", "ps"))
+_DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, ValueError, KeyError, NotImplementedError)
+
+
+def is_here(path: Path) -> bool:
+    """Whether a folder has an archive with the four arrays."""
+    return any(_names(file) is not None for file in path.glob("*.npz"))
+
+
+def load(
+    path: Path | str,
+    *,
+    mosaic: Mosaic = "mono",
+    size: tuple[int, int] | None = None,
+    unit: Unit | None = None,
+    span: tuple[float, float] | None = None,
+) -> EventRecording:
+    """Read an npz file with arrays x, y, t, p (or xs, ys, ts, ps), or the only one in the folder `path`.
+
+    Time 0 is the first event's stamp. In the same folder may lie `poses.txt`, T_world_cam in TUM's format on
+    the clock of the events, and the camera (`event_beside.with_camera`; it also says what `size` is for).
+    What was left out or assumed is told in `notes`; `span`, `unit` and what is refused are those of
+    `event_clean.clean`.
+    """
+    source = find(path, size=size)
+    truth = source.stream.file.parent / "poses.txt"
+    return load_source(source, truth, mosaic=mosaic, unit=unit, span=span)[0]
+
+
+def find(path: Path | str, *, size: tuple[int, int] | None = None) -> Source:
+    """The file and the camera that `load` reads."""
+    return with_camera(npz_stream(_file(Path(path))), size)
+
+
+def npz_stream(file: Path) -> Stream:
+    """The events of an archive, of which no more than a block is in memory; DataError for what is none."""
+    return Stream(file, lambda: _blocks(file), lambda row: f"{file}: event {row}")
+
+
+def _file(path: Path) -> Path:
+    if path.is_file():
+        return path
+    files = [file for file in sorted(path.glob("*.npz")) if _names(file) is not None]
+    return only(files, path, "one npz file with arrays x y t p")
+
+
+def _names(file: Path) -> tuple[str, ...] | None:
+    """What the file calls t, x, y and p; None where it has no such arrays."""
+    try:
+        with zipfile.ZipFile(file) as archive:
+            members = {name.removesuffix(".npy") for name in archive.namelist()}
+    except (*_DAMAGED, OSError):
+        return None
+    return next((names for names in _NAMES if members.issuperset(names)), None)
+
+
+def _blocks(file: Path) -> Iterator[Block]:
+    try:
+        with ExitStack() as stack:
+            archive = stack.enter_context(zipfile.ZipFile(file))
+            members = {name.removesuffix(".npy") for name in archive.namelist()}
+            names = next((names for names in _NAMES if members.issuperset(names)), None)
+            if names is None:
+                got = some(sorted(members)) or "none"
+                raise DataError(f"{file}: expected arrays x y t p (or xs ys ts ps), got {got}")
+            columns: list[Any] = [stack.enter_context(archive.open(f"{name}.npy")) for name in names]
+            kinds, lengths = zip(
+                *(_header(file, *pair) for pair in zip(names, columns, strict=True)), strict=True
+            )
+            if len(set(lengths)) != 1:
+                got = ", ".join(f"{length} {name}" for name, length in zip(names, lengths, strict=True))
+                raise DataError(f"{file}: expected arrays of one length, got {got}")
+            for start in range(0, lengths[0], BLOCK):
+                rows = min(BLOCK, lengths[0] - start)
+                yield Block(*(_rows(column, kind, rows) for column, kind in zip(columns, kinds, strict=True)))
+            # The end has the checksum.
+            for column in columns:
+                column.read()
+    except _DAMAGED as error:
+        raise DataError(f"{file}: expected a whole npz file, got {' '.join(str(error).split())}") from None
+
+
+def _header(file: Path, name: str, column: zipfile.ZipExtFile) -> tuple[np.dtype, int]:
+    """Kind of number and length of an array."""
+    version = np.lib.format.read_magic(column)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, kind = read(column)
+    if len(shape) != 1 or kind.hasobject:
+        raise DataError(f"{file}: expected {name} as a row of numbers, got {kind} of shape {shape}")
+    return kind, shape[0]
+
+
+def _rows(column: zipfile.ZipExtFile, kind: np.dtype, rows: int) -> np.ndarray:
+    content = column.read(rows * kind.itemsize)
+    if len(content) < rows * kind.itemsize:
+        raise EOFError("an array that ends early")
+    return np.frombuffer(content, kind)

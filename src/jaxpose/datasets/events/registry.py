@@ -1,0 +1,85 @@
+"""Any recording of events: which of the layouts a folder or file has, told by its files, and its loader."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Literal, NamedTuple, Protocol, get_args
+
+from jaxpose.datasets.events import davis, eventnerf
+from jaxpose.datasets.events import hdf5 as event_hdf5
+from jaxpose.datasets.events import npz as event_npz
+from jaxpose.datasets.events.sidecar import Source
+from jaxpose.datasets.events.stream import Unit
+from jaxpose.datasets.images import found
+from jaxpose.datasets.types import EventRecording
+from jaxpose.errors import DataError
+from jaxpose.events import Mosaic
+
+Format = Literal["eventnerf", "davis", "hdf5", "npz"]
+
+
+class _Module(Protocol):
+    """What the module of a layout has."""
+
+    is_here: Callable[[Path], bool]
+    find: Callable[..., Source]
+    load: Callable[..., EventRecording]
+
+
+class _Layout(NamedTuple):
+    """What a layout looks like in words and in a file's suffix, its module, and the colour of its pixels."""
+
+    files: str
+    suffixes: tuple[str, ...]
+    module: _Module
+    mosaic: Mosaic
+
+
+# In the order in which they are tried: EventNeRF's events are an npz, too.
+_LAYOUTS: dict[Format, _Layout] = {
+    "eventnerf": _Layout("intrinsics/, pose/ and events/*.npz", (), eventnerf, "rggb"),
+    "davis": _Layout("events.txt", (".txt",), davis, "mono"),
+    "hdf5": _Layout("an HDF5 file", (".h5", ".hdf5"), event_hdf5, "mono"),
+    "npz": _Layout("an npz file with x y t p", (".npz",), event_npz, "mono"),
+}
+
+
+def find_format(path: Path | str) -> Format:
+    """The layout of a folder by its files, or of a file by its suffix.
+
+    DataError saying what was expected and what is there.
+    """
+    path = Path(path)
+    for name in get_args(Format):
+        layout = _LAYOUTS[name]
+        if (
+            layout.module.is_here(path)
+            if path.is_dir()
+            else path.is_file() and path.suffix in layout.suffixes
+        ):
+            return name
+    expected = ", or ".join(f"{layout.files} ({name})" for name, layout in _LAYOUTS.items())
+    raise DataError(f"{path}: expected a recording of events, {expected}, got {found(path)}")
+
+
+def find(path: Path | str, format: Format | None = None, *, size: tuple[int, int] | None = None) -> Source:
+    """The file of events and the camera that `load` reads, before it does."""
+    return _LAYOUTS[format or find_format(path)].module.find(path, size=size)
+
+
+def load(
+    path: Path | str,
+    format: Format | None = None,
+    *,
+    mosaic: Mosaic | None = None,
+    size: tuple[int, int] | None = None,
+    unit: Unit | None = None,
+    span: tuple[float, float] | None = None,
+) -> EventRecording:
+    """Read a recording of events in the layout `format`, or in the one that `find_format` finds.
+
+    `mosaic` is the colour of the pixels: without it "rggb" for EventNeRF's layout, else "mono". `size`
+    (width, height) is that of the sensor where no file tells it, `unit` that of the stamps, and `span` [s]
+    the part to read; see the loaders, whose errors these are.
+    """
+    layout = _LAYOUTS[format or find_format(path)]
+    return layout.module.load(path, mosaic=mosaic or layout.mosaic, size=size, unit=unit, span=span)

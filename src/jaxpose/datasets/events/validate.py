@@ -1,0 +1,142 @@
+"""Events made fit for use: in order, on the sensor, with polarities 1 and -1; or refused in one line."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxpose.datasets.events.stream import Stream, Tally, Unit, inside, listed, reach, tallied
+from jaxpose.errors import DataError
+from jaxpose.events import Events
+
+_WORDS: dict[Unit, str] = {
+    "s": "seconds",
+    "us": "microseconds",
+    "ns": "nanoseconds",
+    "frames": "frame indices",
+}
+_MOST_OUTSIDE = 0.1  # share of the events; more is another sensor
+_MOST_BACK = 0.01  # share of the events that are earlier than one before; more is no order
+_MOST_BACK_S = 0.01  # by which one may be (of indices: 1); more is a clock that jumped, or two recordings
+
+
+class Read(NamedTuple):
+    """Events in order, what was counted on the way, and what the user has to know."""
+
+    events: Events
+    tally: Tally
+    notes: tuple[str, ...]
+
+
+def clean(
+    stream: Stream,
+    size: tuple[int, int],
+    *,
+    unit: Unit | None = None,
+    span: tuple[float, float] | None = None,
+    zero: int | None = None,
+) -> Read:
+    """The events of a stream, or those from span[0] to before span[1] [s], in 13 bytes each.
+
+    Time 0 is the stamp `zero`, else the first in the file. Stamps are in `unit`; without it in the unit that
+    the format states or, if that gives no possible rate, that `find_unit` finds, which a note then says.
+    Polarities are 0 and 1, or -1 and 1. Events outside the sensor of `size` (width, height) are left out and
+    counted in a note; more than 10% of them are refused. Up to 1% may be earlier than one before, by up to
+    10 ms (of indices: 1), as readout mixes them: they are sorted, equal stamps in the order of the file, and
+    counted in a note; more is refused. Events that repeat others are kept.
+
+    DataError naming file and line (or event) for what is refused, for NaN and infinity, for pixels that are
+    no whole numbers, and for no event at all; ValueError for a span that does not rise.
+    """
+    check_span(span)
+    tally, columns = None, ([], [], [], [])
+    for tally, block in tallied(stream, size, unit, zero):
+        if tally.odd is not None:
+            break
+        kept = inside(block, size)
+        if span is not None:
+            kept &= (span[0] <= block.t) & (block.t < span[1])
+        for column, values, kind in zip(
+            columns, block, (np.float64, np.uint16, np.uint16, np.int8), strict=True
+        ):
+            column.append(values[kept].astype(kind))
+        if span is not None and tally.latest >= span[1] + _most_back(tally.unit):
+            break
+    _refuse(stream, size, tally)
+    if tally is None or not any(map(len, columns[0])):
+        raise DataError(f"{stream.file}: expected events, got none" + (_in_words(span) if span else ""))
+    t, x, y, polarity = (_joined(column) for column in columns)
+    if 0.0 in tally.polarities:
+        polarity = np.where(polarity == 0, np.int8(-1), polarity)
+    if tally.back:
+        order = np.argsort(t, kind="stable")
+        t, x, y, polarity = t[order], x[order], y[order], polarity[order]
+    return Read(Events(t, x, y, polarity), tally, _notes(stream, size, unit, tally))
+
+
+def check_span(span: tuple[float, float] | None) -> None:
+    """ValueError for a span that does not rise."""
+    if span is not None and not span[0] < span[1]:
+        raise ValueError(f"span: expected two rising times [s], got {span[0]:g} and {span[1]:g}")
+
+
+def _most_back(unit: Unit) -> float:
+    return 1.0 if unit == "frames" else _MOST_BACK_S
+
+
+def _joined(column: list[np.ndarray]) -> np.ndarray:
+    """One array of many, which are let go at once."""
+    whole = np.concatenate(column)
+    column.clear()
+    return whole
+
+
+def _refuse(stream: Stream, size: tuple[int, int], tally: Tally | None) -> None:
+    """DataError for polarities, pixels and an order that cannot be meant."""
+    if tally is None:
+        return
+    polarities = "polarities 0 and 1, or -1 and 1"
+    if tally.odd is not None:
+        value = max(tally.polarities - {-1.0, 0.0, 1.0})
+        raise DataError(f"{stream.where(tally.odd)}: expected {polarities}, got {value:g}")
+    if {-1.0, 0.0} <= tally.polarities:
+        raise DataError(f"{stream.file}: expected {polarities}, got {listed(tally.polarities)}")
+    if tally.outside > _MOST_OUTSIDE * tally.count:
+        raise DataError(
+            f"{stream.file}: expected pixels of {size[0]}x{size[1]}, got {tally.outside} of {tally.count} "
+            f"events outside, {reach(tally)}"
+        )
+    if tally.back > _MOST_BACK * tally.count or tally.most_back > _most_back(tally.unit):
+        raise DataError(
+            f"{stream.where(tally.first_back or 0)}: expected events in the order of time, got "
+            f"{tally.back} of {tally.count} earlier than one before, by up to {tally.most_back:.3g} s"
+        )
+
+
+def _notes(stream: Stream, size: tuple[int, int], unit: Unit | None, tally: Tally) -> tuple[str, ...]:
+    """What was guessed, left out and sorted."""
+    notes = []
+    if unit is None and tally.unit != stream.unit:
+        span = tally.latest - tally.earliest
+        note = f"stamps read as {_WORDS[tally.unit]}"
+        if stream.unit is not None:
+            note += f", as in the format's {_WORDS[stream.unit]} their rate would be impossible"
+        if tally.unit == "frames":
+            note += f", 1 s each: {tally.count} events in {span:.4g} frames"
+        elif span:
+            note += f": {tally.count} events in {span:.4g} s, {tally.count / span:.3g} Hz"
+        notes.append(note)
+    if tally.outside:
+        notes.append(
+            f"{tally.outside} of {tally.count} events left out, outside the sensor of {size[0]}x{size[1]}: "
+            f"{reach(tally)}"
+        )
+    if tally.back:
+        notes.append(
+            f"{tally.back} of {tally.count} events were earlier than one before, by up to "
+            f"{tally.most_back:.3g} s: sorted"
+        )
+    return tuple(notes)
+
+
+def _in_words(span: tuple[float, float]) -> str:
+    return f" from {span[0]:g} to {span[1]:g} s"

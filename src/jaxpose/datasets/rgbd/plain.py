@@ -1,0 +1,205 @@
+"""A plain folder: images in `color/` and `depth/`, intrinsics, and optional `poses.txt` and `times.txt`."""
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxpose.datasets.images import (
+    INTRINSICS,
+    SUFFIXES,
+    Pinhole,
+    beside,
+    check_depth,
+    check_intrinsics,
+    check_positive,
+    common_size,
+    found,
+    frame_times,
+    name_of,
+    natural_order,
+    read_color,
+    read_depth,
+    read_intrinsics,
+    some,
+    usable_poses,
+    within,
+)
+from jaxpose.datasets.types import Frame, Recording
+from jaxpose.errors import DataError
+from jaxpose.files.tables import read_numbers
+from jaxpose.files.trajectories import nearest, read_kitti, read_tum
+from jaxpose.geometry.camera import Camera
+
+_JSON = "intrinsics.json"
+_MOST_APART_S = 0.02  # between a frame's stamp and that of its pose
+_POSE_COLUMNS = "16 (4x4), 12 (KITTI) or 8 (TUM) numbers"
+
+
+class _Stated(NamedTuple):
+    pinhole: Pinhole
+    depth_per_metre: float | None
+
+
+def is_here(path: Path) -> bool:
+    """Whether a folder has one of the layout's two folders."""
+    return (path / "color").is_dir() or (path / "depth").is_dir()
+
+
+def load(path: Path | str, *, rate_hz: float = 30.0, depth_per_metre: float | None = None) -> Recording:
+    """Read the folder `path`: `color/` and `depth/` with png or jpg images, in the order of their numbers.
+
+    They are paired by equal names, or in order if no names are equal and there are as many of both.
+    Intrinsics are those of `camera-intrinsics.txt` (3x3) or `intrinsics.json` (fx fy cx cy, and optional
+    width height depth_scale), in the folder or one up. Depth is registered to colour, 16 bits; counts per
+    metre are `depth_per_metre`, else the file's depth_scale, else 1000.
+
+    `times.txt` has a stamp [s] for each colour image; without it their period is 1 / rate_hz. `poses.txt` has
+    a camera-to-world pose for each colour image, of 16 numbers (4x4, NaN where there is none) or KITTI's 12,
+    or TUM's lines of 8: these go by their stamps, within 0.02 s, if there is a `times.txt`, and state the
+    times of as many images if there is none. What was left out or assumed is told in `notes`.
+
+    DataError naming the file for anything that cannot be used; ValueError for a setting that is not positive.
+    """
+    if depth_per_metre is not None:
+        check_positive("depth_per_metre", depth_per_metre)
+    folder = Path(path)
+    all_colors, depths_all = _images(folder, "color"), _images(folder, "depth")
+    rows, partners, paired = _pairs(folder, all_colors, depths_all)
+    colors, depths = [all_colors[i] for i in rows], [depths_all[i] for i in partners]
+    size = common_size([*colors, *depths])
+    pinhole, stated_per_metre = _intrinsics(folder, size)
+    per_metre = depth_per_metre or stated_per_metre or 1000.0
+    assumed = () if depth_per_metre or stated_per_metre else ("no depth_scale: took depth as mm",)
+    check_depth(folder, depths, per_metre)
+    read_color(colors[0])
+    t, truth = _times_and_poses(folder, len(all_colors), rate_hz)
+    if truth is None:
+        poses, lacking = None, ("no poses.txt: there is no truth to compare with",)
+    else:
+        names = [color.stem for color in colors]
+        poses, lacking = usable_poses(
+            truth[rows], names, lambda i: f"{folder / 'poses.txt'}: pose {rows[i]}", "none, NaN or infinity"
+        )
+    return Recording(
+        name=name_of(folder),
+        camera=Camera(*pinhole, *size),
+        t=t[rows] - t[rows[0]],
+        read=lambda i: Frame(read_color(colors[i]), read_depth(depths[i], per_metre)),
+        T_world_cam=poses,
+        notes=(*paired, *assumed, *lacking),
+        t0=float(t[rows[0]]),
+        files=within(colors, path),
+    )
+
+
+def _images(folder: Path, kind: str) -> list[Path]:
+    """Image files of a folder, r_2 before r_10."""
+    if not (folder / kind).is_dir():
+        raise DataError(f"{folder}: expected folders color/ and depth/, got {found(folder)}")
+    files = [file for file in (folder / kind).iterdir() if file.suffix.lower() in SUFFIXES]
+    if not files:
+        raise DataError(f"{folder / kind}: expected png or jpg images, got {found(folder / kind)}")
+    return sorted(files, key=lambda file: natural_order(file.name))
+
+
+def _pairs(
+    folder: Path, colors: Sequence[Path], depths: Sequence[Path]
+) -> tuple[list[int], list[int], tuple[str, ...]]:
+    """Indices of colour and depth images that belong together, and a note on how or what is left out."""
+    by_stem = {depth.stem: j for j, depth in enumerate(depths)}
+    rows = [i for i, color in enumerate(colors) if color.stem in by_stem]
+    if rows:
+        alone = sorted({file.stem for file in colors} ^ by_stem.keys(), key=natural_order)
+        notes = (f"{len(alone)} images without a partner left out: {some(alone)}",) if alone else ()
+        return rows, [by_stem[colors[i].stem] for i in rows], notes
+    if len(colors) != len(depths):
+        raise DataError(
+            f"{folder}: expected colour and depth of equal names or equal number, got {len(colors)} as "
+            f"{colors[0].name} and {len(depths)} as {depths[0].name}"
+        )
+    note = f"colour and depth paired in order: {colors[0].name} with {depths[0].name} and so on"
+    return list(range(len(colors))), list(range(len(colors))), (note,)
+
+
+def _intrinsics(folder: Path, size: tuple[int, int]) -> _Stated:
+    """Intrinsics, and the depth scale if the file has one."""
+    if (file := beside(folder, INTRINSICS)) is not None:
+        return _Stated(read_intrinsics(file, size), None)
+    if (file := beside(folder, _JSON)) is None:
+        raise DataError(f"{folder}: expected {INTRINSICS} or {_JSON} in it or one folder up, got neither")
+    try:
+        values = json.loads(file.read_text("utf-8-sig"))
+        fx, fy, cx, cy = (float(values[key]) for key in ("fx", "fy", "cx", "cy"))
+        stated = (float(values.get("width", size[0])), float(values.get("height", size[1])))
+        per_metre = float(values["depth_scale"]) if "depth_scale" in values else None
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise DataError(
+            f"{file}: expected numbers fx fy cx cy [width height depth_scale], "
+            f"got {type(error).__name__} {error}"
+        ) from None
+    if stated != size:
+        raise DataError(
+            f"{file}: expected the size of the images, {size[0]}x{size[1]}, got {stated[0]:g}x{stated[1]:g}"
+        )
+    if per_metre is not None and not 0 < per_metre < math.inf:
+        raise DataError(f"{file}: expected a positive depth_scale, got {per_metre}")
+    return _Stated(check_intrinsics(file, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), size), per_metre)
+
+
+def _times_and_poses(
+    folder: Path, count: int, rate_hz: float
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 4 4"] | None]:
+    """Times [s] of all colour images, and their poses."""
+    t = _read_times(folder / "times.txt", count)
+    file = folder / "poses.txt"
+    columns = _columns(file) if file.is_file() else 0
+    if columns == 8:
+        trajectory = read_tum(file, first_of_equal=t is not None)
+        if t is None:
+            _check_count(file, len(trajectory.t), count)
+            return trajectory.t, trajectory.T
+        row = nearest(t, trajectory.t)
+        near = np.abs(trajectory.t[row] - t) <= _MOST_APART_S
+        return t, np.where(near[:, None, None], trajectory.T[row], np.nan)
+    if t is None:
+        t = frame_times(range(count), rate_hz)
+    if columns == 0:
+        return t, None
+    if columns == 12:
+        T = read_kitti(file).T
+    else:
+        T = read_numbers(file, _POSE_COLUMNS, (16,), finite=False)[1].reshape(-1, 4, 4)
+    _check_count(file, len(T), count)
+    return t, T
+
+
+def _read_times(file: Path, count: int) -> Float[np.ndarray, " n"] | None:
+    """Increasing stamps, one for each colour image; None without a file."""
+    if not file.is_file():
+        return None
+    lines, values = read_numbers(file, "1 number (a stamp in seconds)", (1,))
+    _check_count(file, len(values), count)
+    t = values[:, 0]
+    for row in np.flatnonzero(np.diff(t) <= 0) + 1:
+        raise DataError(f"{file}:{lines[row]}: expected a stamp after {t[row - 1]:g} s, got {t[row]:g} s")
+    return t
+
+
+def _columns(file: Path) -> int:
+    """How many numbers the first line of a file of poses has."""
+    for number, line in enumerate(file.read_text("utf-8-sig", "replace").splitlines(), start=1):
+        if line.strip() and not line.lstrip().startswith("#"):
+            if (columns := len(line.split())) not in (8, 12, 16):
+                raise DataError(f"{file}:{number}: expected {_POSE_COLUMNS}, got {columns}")
+            return columns
+    raise DataError(f"{file}: expected lines of {_POSE_COLUMNS}, got none")
+
+
+def _check_count(file: Path, got: int, count: int) -> None:
+    if got != count:
+        raise DataError(f"{file}: expected {count} lines, one for each image in color/, got {got}")

@@ -1,0 +1,62 @@
+"""Any recording: which of the layouts a folder has, told by its files, and its loader."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Literal, NamedTuple, get_args
+
+from jaxpose.datasets.images import found
+from jaxpose.datasets.rgbd import euroc, plain, replica, scannet, sevenscenes, tum
+from jaxpose.datasets.types import Recording
+from jaxpose.errors import DataError
+
+Format = Literal["sevenscenes", "tum", "replica", "scannet", "euroc", "plain"]
+
+
+class _Layout(NamedTuple):
+    """What a layout looks like in words, whether a folder has it, and its loader."""
+
+    files: str
+    is_here: Callable[[Path], bool]
+    load: Callable[[Path | str, float], Recording]
+
+
+# In the order in which they are tried: the plain folder has least of its own, so it is last.
+_LAYOUTS: dict[Format, _Layout] = {
+    "sevenscenes": _Layout(
+        "frame-NNNNNN.color.png and frame-NNNNNN.depth.png",
+        sevenscenes.is_here,
+        lambda path, rate_hz: sevenscenes.load(path, rate_hz=rate_hz),
+    ),
+    "tum": _Layout("rgb.txt and depth.txt", tum.is_here, lambda path, rate_hz: tum.load(path)),
+    "replica": _Layout(
+        "results/ and traj.txt", replica.is_here, lambda path, rate_hz: replica.load(path, rate_hz=rate_hz)
+    ),
+    "scannet": _Layout(
+        "color/, depth/ and pose/", scannet.is_here, lambda path, rate_hz: scannet.load(path, rate_hz=rate_hz)
+    ),
+    "euroc": _Layout("mav0/cam0 and mav0/imu0", euroc.is_here, lambda path, rate_hz: euroc.load(path)),
+    "plain": _Layout(
+        "color/, depth/ and intrinsics",
+        plain.is_here,
+        lambda path, rate_hz: plain.load(path, rate_hz=rate_hz),
+    ),
+}
+
+
+def find_format(path: Path | str) -> Format:
+    """The layout of the folder `path`, by its files; DataError saying what was expected and what is there."""
+    path = Path(path)
+    if path.is_dir():
+        for name in get_args(Format):
+            if _LAYOUTS[name].is_here(path):
+                return name
+    expected = ", or ".join(f"{layout.files} ({name})" for name, layout in _LAYOUTS.items())
+    raise DataError(f"{path}: expected a folder of {expected}, got {found(path)}")
+
+
+def load(path: Path | str, format: Format | None = None, *, rate_hz: float = 30.0) -> Recording:
+    """Read a recording in the layout `format`, or in the one that `find_format` finds.
+
+    `rate_hz` is the frame rate where a layout has no time stamps. Errors as those of the loader.
+    """
+    return _LAYOUTS[format or find_format(path)].load(path, rate_hz)

@@ -1,0 +1,211 @@
+"""The TUM RGB-D layout: `rgb.txt` and `depth.txt` list stamped images, `groundtruth.txt` the true poses."""
+
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxpose.datasets.images import (
+    INTRINSICS,
+    Pinhole,
+    beside,
+    check_depth,
+    check_positive,
+    common_size,
+    found,
+    name_of,
+    published,
+    read_color,
+    read_depth,
+    read_intrinsics,
+    some,
+    usable_poses,
+    within,
+)
+from jaxpose.datasets.types import Accelerometer, Frame, Recording
+from jaxpose.errors import DataError
+from jaxpose.files.tables import read_numbers
+from jaxpose.files.trajectories import nearest
+from jaxpose.files.trajectory_reader import read_trajectory
+from jaxpose.geometry.camera import Camera
+from jaxpose.imu import GRAVITY_WORLD
+from jaxpose.imu.gravity import gravity_note
+
+_SIZE = (640, 480)
+_NOMINAL = Pinhole(525.0, 525.0, 319.5, 239.5)
+_R_CAM_KINECT = np.diag([-1.0, -1.0, 1.0])
+# By the data set's three cameras: the colour camera's intrinsics, and k1 k2 p1 p2 k3 of its lens.
+_CAMERAS: dict[str, tuple[Pinhole, tuple[float, ...]]] = {
+    "1": (Pinhole(517.3, 516.5, 318.6, 255.3), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+    "2": (Pinhole(520.9, 521.0, 325.1, 249.7), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
+    "3": (Pinhole(535.4, 539.2, 320.1, 247.6), ()),
+}
+
+
+class Stamped(NamedTuple):
+    """A list of images."""
+
+    t: Float[np.ndarray, " n"]  # seconds since 1970
+    files: list[Path]
+
+
+def is_here(path: Path) -> bool:
+    """Whether a folder has one of the layout's lists."""
+    return (path / "rgb.txt").is_file() or (path / "depth.txt").is_file()
+
+
+def load(path: Path | str, *, max_difference_s: float = 0.02, depth_per_metre: float = 5000.0) -> Recording:
+    """Read the sequence folder `path`.
+
+    Colour and depth are paired one to one, nearest first, if their stamps are less than `max_difference_s`
+    apart (0.02 s is the data set's own tools'); frames have the stamps of colour. The true pose is the one
+    nearest in time, NaN where none is that close; without `groundtruth.txt` there is no truth, and of lines
+    with one stamp (the published fr2_desk has two) the first counts. Intrinsics (3x3) are read from
+    `camera-intrinsics.txt` in or beside the folder; else they and the lens are the published ones of
+    freiburg1, 2 or 3, by the folder's name. Depth is registered to colour and stored as `depth_per_metre`
+    counts. `accelerometer.txt` (m/s^2) is the Kinect's own, whose axes are left, up and forward (Microsoft's
+    Kinect documentation, "Accelerometer"): without truth it says which way is up. `notes` tells what was left
+    out or assumed, and whether the accelerometer disagrees with the truth.
+
+    DataError naming the file for anything that cannot be used; ValueError for a setting that is not positive.
+    """
+    check_positive("max_difference_s", max_difference_s)
+    check_positive("depth_per_metre", depth_per_metre)
+    folder = Path(path)
+    if not folder.is_dir():
+        raise DataError(f"{folder}: expected a folder with rgb.txt and depth.txt, got {found(folder)}")
+    color, depth = read_list(folder / "rgb.txt"), read_list(folder / "depth.txt")
+    rows, partners = _pairs(folder, color.t, depth.t, max_difference_s)
+    stamps = color.t[rows]
+    colors, depths = [color.files[i] for i in rows], [depth.files[i] for i in partners]
+    size = common_size([*colors, *depths])
+    pinhole, lens, assumed = _camera(folder, size)
+    check_depth(folder, depths, depth_per_metre)
+    read_color(colors[0])
+    poses, lacking = _truth(folder / "groundtruth.txt", stamps, max_difference_s)
+    notes = [*_alone("colour", "depth", color, rows, max_difference_s)]
+    notes += [*_alone("depth", "colour", depth, partners, max_difference_s), *assumed, *lacking]
+    accelerometer, weighed = _accelerometer(folder / "accelerometer.txt", stamps, poses)
+    return Recording(
+        name=name_of(folder),
+        camera=Camera(*pinhole, *size, lens),
+        t=stamps - stamps[0],
+        read=lambda i: Frame(read_color(colors[i]), read_depth(depths[i], depth_per_metre)),
+        T_world_cam=poses,
+        accelerometer=accelerometer,
+        notes=(*notes, *weighed),
+        t0=float(stamps[0]),
+        files=within(colors, path),
+    )
+
+
+def read_list(file: Path) -> Stamped:
+    """Lines of `stamp name`, names relative to the list, stamps increasing."""
+    if not file.is_file():
+        raise DataError(f"{file}: expected lines of a stamp and a file name, got {found(file)}")
+    stamps, files = [], []
+    for number, line in enumerate(file.read_text("utf-8-sig", "replace").splitlines(), start=1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        fields = line.split(maxsplit=1)
+        try:
+            stamp, name = float(fields[0]), fields[1].strip()
+        except (ValueError, IndexError):
+            stamp, name = np.nan, ""
+        if not np.isfinite(stamp):
+            raise DataError(
+                f"{file}:{number}: expected a stamp in seconds and a file name, got {line[:60]!r}"
+            )
+        if stamps and stamp <= stamps[-1]:
+            raise DataError(f"{file}:{number}: expected a stamp after {stamps[-1]!r} s, got {stamp!r} s")
+        stamps.append(stamp)
+        files.append(file.parent / name)
+    if not stamps:
+        raise DataError(f"{file}: expected lines of a stamp and a file name, got none")
+    return Stamped(np.array(stamps), files)
+
+
+def _pairs(
+    folder: Path, t: Float[np.ndarray, " n"], other: Float[np.ndarray, " m"], limit: float
+) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
+    """Indices of stamps less than `limit` apart, each used once, the closest pairs first."""
+    first, last = np.searchsorted(other, t - limit), np.searchsorted(other, t + limit)
+    near = sorted((abs(t[i] - other[j]), i, j) for i in range(len(t)) for j in range(first[i], last[i]))
+    partner: dict[int, int] = {}
+    taken: set[int] = set()
+    for difference, i, j in near:
+        if difference < limit and i not in partner and j not in taken:
+            partner[i] = j
+            taken.add(j)
+    if not partner:
+        spans = [f"{x[0]:.3f} to {x[-1]:.3f} s" for x in (t, other)]
+        raise DataError(
+            f"{folder}: expected colour and depth within {limit:g} s, got stamps from {' and '.join(spans)}"
+        )
+    rows = sorted(partner)
+    return np.array(rows), np.array([partner[i] for i in rows])
+
+
+def _alone(
+    kind: str, other: str, images: Stamped, used: Int[np.ndarray, " k"], limit: float
+) -> tuple[str, ...]:
+    """A note on images that found no partner."""
+    alone = [images.files[i].name for i in np.setdiff1d(np.arange(len(images.t)), used)]
+    if not alone:
+        return ()
+    note = (
+        f"{len(alone)} of {len(images.t)} {kind} images left out, no {other} of their own within {limit:g} s"
+    )
+    return (f"{note}: {some(alone)}",)
+
+
+def _camera(folder: Path, size: tuple[int, int]) -> tuple[Pinhole, tuple[float, ...], tuple[str, ...]]:
+    """Intrinsics, lens, and a note where they are assumed."""
+    file = beside(folder, INTRINSICS)
+    if file is not None:
+        return read_intrinsics(file, size), (), ()
+    match = re.search(r"(?<![a-z])(?:freiburg|fr)([123])(?!\d)", folder.resolve().name.lower())
+    pinhole, lens = _CAMERAS[match[1]] if match else (_NOMINAL, ())
+    if match and size == _SIZE:
+        return pinhole, lens, ()
+    without = INTRINSICS if match else f"{INTRINSICS}, and no freiburg1, 2 or 3 in the folder's name"
+    return pinhole, lens, (published(pinhole, size, _SIZE, without),)
+
+
+def _truth(
+    file: Path, stamps: Float[np.ndarray, " n"], limit: float
+) -> tuple[Float[np.ndarray, "n 4 4"] | None, tuple[str, ...]]:
+    """The true poses nearest in time, and a note on frames without."""
+    if not file.is_file():
+        return None, ("no groundtruth.txt: there is no truth to compare with",)
+    truth, form, _, repeated = read_trajectory(file)
+    if form != "TUM":
+        raise DataError(f"{file}: expected lines of t tx ty tz qx qy qz qw, got a {form} file")
+    row = nearest(stamps, truth.t)
+    near = np.abs(truth.t[row] - stamps) < limit
+    poses = np.where(near[:, None, None], truth.T[row], np.nan)
+    names = [f"{t:.6f}" for t in stamps]
+    checked, notes = usable_poses(poses, names, lambda i: str(file), f"none within {limit:g} s")
+    if repeated:
+        notes += (f"{repeated} lines of groundtruth.txt repeat the stamp before them and are ignored",)
+    return checked, notes
+
+
+def _accelerometer(
+    file: Path, stamps: Float[np.ndarray, " n"], T_world_cam: Float[np.ndarray, "n 4 4"] | None
+) -> tuple[Accelerometer | None, tuple[str, ...]]:
+    """The readings on the frames' clock, in the camera's axes, and a note where the truth disagrees."""
+    if not file.is_file():
+        return None, ()
+    if all(line.startswith("#") or not line.strip() for line in file.read_text("utf-8-sig").splitlines()):
+        return None, ("accelerometer.txt has no readings",)
+    _, values = read_numbers(file, "4 numbers (t ax ay az)", (4,))
+    values = values[np.argsort(values[:, 0], kind="stable")]
+    t, force_cam = values[:, 0] - stamps[0], values[:, 1:] @ _R_CAM_KINECT.T
+    if T_world_cam is None:
+        return Accelerometer(t, force_cam), ()
+    gravity = np.array(GRAVITY_WORLD)
+    notes = gravity_note(t, force_cam, stamps - stamps[0], T_world_cam, gravity, "accelerometer.txt")
+    return Accelerometer(t, force_cam), notes

@@ -1,0 +1,124 @@
+"""A recording of a furnished room made on the fly: colour, depth, truth and IMU along one analytic path."""
+
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, UInt8
+
+from jaxpose.datasets.synthetic import hand_held, sensor
+from jaxpose.datasets.synthetic.atlas import Atlas, bake, gather, look_up
+from jaxpose.datasets.synthetic.furniture import Extent, furnish
+from jaxpose.datasets.synthetic.shapes import Shapes, cast, locate, within_cone
+from jaxpose.datasets.synthetic.trajectory import Drive, by_hand, recorded
+from jaxpose.datasets.types import Frame, Recording
+from jaxpose.geometry.camera import Camera, pixel_direction
+from jaxpose.imu import ADIS16448, GRAVITY_WORLD, ImuNoise
+
+
+@dataclass(frozen=True)
+class RoomConfig:
+    """Settings of `room`; every random choice follows from `seed`."""
+
+    duration_s: float = 12.0
+    rate_hz: float = 5.0
+    imu_rate_hz: float = 200.0
+    width: int = 320
+    height: int = 240
+    seed: int = 0
+    speed: float = 1.0  # 1 walks at about 0.5 m/s and turns by 20 to 50 deg/s
+    depth_noise: float = 1.0  # times Kinect's; 0 is exact depth
+    holes: bool = True  # no depth in the projector's shadow and on grazing surfaces
+    imu_noise: ImuNoise = ADIS16448
+    gravity_world: tuple[float, float, float] = GRAVITY_WORLD
+    # A EuRoC sequence whose recorded motion and IMU take the place of the walk and of `imu_*`.
+    along: Path | None = None
+
+    def __post_init__(self):
+        for name in ("duration_s", "rate_hz", "imu_rate_hz", "width", "height", "speed"):
+            if not 0 < getattr(self, name) < np.inf:
+                raise ValueError(f"RoomConfig.{name}: expected a positive number, got {getattr(self, name)}")
+        for name in ("seed", "depth_noise"):
+            if not 0 <= getattr(self, name) < np.inf:
+                raise ValueError(f"RoomConfig.{name}: expected zero or more, got {getattr(self, name)}")
+        if self.duration_s * self.rate_hz < 1:
+            raise ValueError(f"RoomConfig: expected two frames, got {self.duration_s} s at {self.rate_hz} Hz")
+
+
+def room(config: RoomConfig = RoomConfig()) -> Recording:
+    """A walk through a furnished room, 5 x 4 x 2.6 m; frames are rendered when they are read.
+
+    The world is z-up with its origin on the floor; the body is the IMU, its axes forwards, left, up. With
+    `config.along` it is a recorded motion with its readings (`drive.recorded`), the room as large as needed.
+    """
+    drive = _drive(config)
+    shapes, atlas = scenery(config.seed, drive.room)
+    focal = 585 / 640 * config.width  # Kinect's angle of view
+    centre = (config.width - 1) / 2, (config.height - 1) / 2
+    camera = Camera(focal, focal, *centre, config.width, config.height)
+    T_world_cam = drive.T_world_body @ drive.T_body_cam
+
+    @lru_cache(maxsize=128)
+    def read(i: int) -> Frame:
+        rgb, depth, cosine = jax.device_get(render(camera, shapes, atlas, np.float32(T_world_cam[i])))
+        noise_rng, hole_rng = np.random.default_rng([config.seed, i]).spawn(2)
+        seen = ~sensor.holes(depth, cosine, camera, hole_rng) if config.holes else True
+        if config.depth_noise:
+            depth = sensor.add_noise(depth, noise_rng, scale=config.depth_noise)
+        depth = np.where(seen, depth, np.float32(0))
+        depth.setflags(write=False)  # the next reader gets the same array
+        return Frame(rgb, depth)
+
+    return Recording(
+        drive.name, camera, drive.t, read, T_world_cam, drive.imu, drive.T_body_cam,
+        np.asarray(config.gravity_world, float), drive.notes,
+    )  # fmt: skip
+
+
+@lru_cache(maxsize=2)
+def scenery(seed: int, size: Extent) -> tuple[Shapes, Atlas]:
+    """What stands in a room of this size, with paint and light: seconds of work, the same for every walk."""
+    palette, brush, _ = np.random.default_rng(seed).spawn(3)
+    pieces, shapes = gather(furnish(palette, size))
+    return shapes, bake(pieces, shapes, brush)
+
+
+def _drive(config: RoomConfig) -> Drive:
+    if config.along is not None:
+        return recorded(config.along, config.duration_s, config.rate_hz)
+    t = np.arange(int(np.floor(config.duration_s * config.rate_hz + 1e-9)) + 1) / config.rate_hz
+    *_, path = np.random.default_rng(config.seed).spawn(3)
+    walk = hand_held.draw(path, config.speed)
+    return by_hand(walk, t, config.imu_rate_hz, config.imu_noise, config.gravity_world, seed=config.seed)
+
+
+@partial(jax.jit, static_argnums=0)
+def render(
+    camera: Camera, shapes: Shapes, atlas: Atlas, T_world_cam: Float[Array, "4 4"]
+) -> tuple[UInt8[Array, "h w 3"], Float[Array, "h w"], Float[Array, "h w"]]:
+    """Colour, depth [m] at pixel centres, and the cosine of incidence there.
+
+    Colour mixes the centre of a pixel (one half) with its four corners, which neighbours share.
+    """
+    h, w = camera.height, camera.width
+    coordinates = lambda n, first: jnp.arange(n, dtype=jnp.float32) + jnp.float32(first)
+    centres = jnp.stack(jnp.meshgrid(coordinates(w, 0), coordinates(h, 0)), -1).reshape(-1, 2)
+    corners = jnp.stack(jnp.meshgrid(coordinates(w + 1, -0.5), coordinates(h + 1, -0.5)), -1).reshape(-1, 2)
+    x, y, z = pixel_direction(camera, jnp.concatenate([centres, corners])).T
+    right, down, forwards, eye = T_world_cam[:3].T
+    ray = tuple(right[k] * x + down[k] * y + forwards[k] * z for k in range(3))
+    origin = tuple(eye[:, None])
+
+    seen = within_cone(shapes, eye, forwards, 1 / jnp.sqrt(jnp.max(x * x + y * y) + 1))
+    hit = locate(shapes, origin, ray, *cast(shapes, origin, ray, seen=seen))
+    # the spacing of samples on the surface; stretched by slant, though not by as much as along the slant
+    footprint = 0.7 / camera.fx * hit.distance / jnp.sqrt(jnp.maximum(hit.cosine, 0.05))
+    colour = look_up(atlas, hit, footprint)
+    middle, corner = colour[:, : h * w].reshape(3, h, w), colour[:, h * w :].reshape(3, h + 1, w + 1)
+    around = corner[:, :-1, :-1] + corner[:, 1:, :-1] + corner[:, :-1, 1:] + corner[:, 1:, 1:]
+    middle = jnp.moveaxis(middle / 2 + around / 8, 0, -1)
+    rgb = jnp.round(middle).astype(jnp.uint8)
+    return rgb, hit.distance[: h * w].reshape(h, w), hit.cosine[: h * w].reshape(h, w)

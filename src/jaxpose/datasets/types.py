@@ -1,0 +1,117 @@
+"""What a loader returns: a recording with depth, photographs, or events, and what is known beside them."""
+
+from collections.abc import Callable
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from jaxpose.errors import DataError
+from jaxpose.events import Events, Mosaic
+from jaxpose.geometry.camera import Camera
+from jaxpose.imu import GRAVITY_WORLD, Imu
+
+
+class Frame(NamedTuple):
+    """One image pair; depth is along the optical axis [m], 0 where there is none."""
+
+    rgb: np.ndarray  # (height, width, 3) uint8
+    depth: np.ndarray  # (height, width) float32
+
+
+class Accelerometer(NamedTuple):
+    """Readings of an accelerometer without a gyroscope: it tells which way is up, but is no IMU."""
+
+    t: Float[np.ndarray, " m"]  # [s]
+    force_cam: Float[np.ndarray, "m 3"]  # [m/s^2] specific force, gravity in it, in the camera's axes
+
+
+class Recording(NamedTuple):
+    """A sequence of RGB-D frames with what is known beside them; all poses float64, camera axes OpenCV."""
+
+    name: str
+    camera: Camera
+    t: np.ndarray  # (n,) seconds since the first frame
+    read: Callable[[int], Frame]
+    T_world_cam: np.ndarray | None = None  # (n, 4, 4) truth, rows of NaN where it is missing
+    imu: Imu | None = None  # on the clock of `t`
+    T_body_cam: np.ndarray = np.eye(4)  # body = IMU
+    gravity_world: np.ndarray = np.array(GRAVITY_WORLD)  # in the frame of `T_world_cam`
+    notes: tuple[str, ...] = ()  # what the loader has to tell the user
+    files: tuple[str, ...] = ()  # each colour image, relative to the recording's folder; empty: on no disk
+    t0: float = 0.0  # where `t` is 0 on the clock of the recording's files [s]
+    accelerometer: Accelerometer | None = None  # on the clock of `t`, of a recording without IMU
+
+
+class Photographs(NamedTuple):
+    """Images of a scene at rest, in memory, with the poses that their source states; camera axes OpenCV."""
+
+    name: str
+    camera: Camera
+    t: Float[np.ndarray, " n"]  # [s], or the frame index where there are no stamps, as `notes` then says
+    rgb: UInt8[np.ndarray, "n h w 3"]  # on white where the file had alpha
+    T_world_cam: Float[np.ndarray, "n 4 4"]  # float64, finite
+    near: float  # depth along the optical axis at which the scene begins and ends [scene units]
+    far: float
+    spacing: Literal["depth", "disparity"]  # what samples between near and far are equally spaced in
+    files: tuple[str, ...]  # each image's name, as its source writes it
+    notes: tuple[str, ...] = ()  # what the loader has to tell the user
+
+
+class EventRecording(NamedTuple):
+    """Events of a moving camera with the poses known at some instants; camera axes OpenCV."""
+
+    name: str
+    camera: Camera
+    mosaic: Mosaic
+    events: Events
+    t: Float[np.ndarray, " k"]  # [s] of the poses, on the clock of `events`, increasing
+    T_world_cam: Float[np.ndarray, "k 4 4"]  # float64, finite
+    threshold: float | None = None  # change of log intensity per event; None: the source does not tell
+    cyclic: bool = False  # whether the motion returns to where it began, as on a turntable
+    frames: Photographs | None = None  # the camera's own images on the same clock, where it takes any
+    held_out: Photographs | None = None  # views to measure a reconstruction on
+    notes: tuple[str, ...] = ()  # what the loader has to tell the user
+
+
+def select(recording: Recording, indices: np.ndarray) -> Recording:
+    """The recording reduced to some of its frames; the clock (and so the IMU) stays as it is."""
+    poses = recording.T_world_cam
+    return recording._replace(
+        t=recording.t[indices],
+        read=lambda i: recording.read(int(indices[i])),
+        T_world_cam=None if poses is None else poses[indices],
+        files=tuple(recording.files[i] for i in indices) if recording.files else (),
+    )
+
+
+def thin(recording: Recording, rate_hz: float) -> Recording:
+    """Keep frames so that their rate is at most `rate_hz`, the first of each period."""
+    period = np.floor((recording.t - recording.t[0]) * rate_hz + 1e-6).astype(int)
+    return select(recording, np.flatnonzero(np.diff(period, prepend=-1) > 0))
+
+
+def take(photographs: Photographs, indices: Int[np.ndarray, " m"]) -> Photographs:
+    """Some of the photographs, in the order given; the clock stays as it is."""
+    return photographs._replace(
+        t=photographs.t[indices],
+        rgb=photographs.rgb[indices],
+        T_world_cam=photographs.T_world_cam[indices],
+        files=tuple(photographs.files[i] for i in indices),
+    )
+
+
+def every(photographs: Photographs, n: int) -> Photographs:
+    """Every n-th photograph, beginning with the first.
+
+    ValueError for n below 1, DataError where fewer than two photographs would be left.
+    """
+    if n < 1:
+        raise ValueError(f"every: expected a step of at least 1, got {n}")
+    indices = np.arange(0, len(photographs.t), n)
+    if len(indices) < 2:
+        raise DataError(
+            f"{photographs.name}: expected at least 2 images, got {len(indices)}"
+            f" (every {n}. of {len(photographs.t)})"
+        )
+    return take(photographs, indices)

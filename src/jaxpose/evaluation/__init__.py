@@ -1,0 +1,1 @@
+"""Errors of trajectories and quality of images."""

@@ -1,0 +1,292 @@
+"""How far an estimate is from the truth: alignment, trajectory errors, image error. numpy, float64.
+
+Poses are camera-to-world (or body-to-world) matrices, matched row by row. Rows with a NaN or an infinity in
+either input carry no information: they are left out and counted, never an error by themselves.
+"""
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxpose.errors import DataError
+from jaxpose.geometry.rigid import Similarity, nearest_rotation, rotation_angle_deg
+
+Alignment = Literal["none", "se3", "sim3"]
+
+
+class Statistics(NamedTuple):
+    """Summary of per-frame errors, in their unit; `std` is that of the population (divided by n)."""
+
+    rmse: float
+    mean: float
+    median: float
+    std: float
+    min: float
+    max: float
+
+
+class Ate(NamedTuple):
+    """Absolute trajectory error [m]: distances between camera centres after alignment."""
+
+    rmse: float
+    mean: float
+    median: float
+    std: float
+    min: float
+    max: float
+    errors: Float[np.ndarray, " n"]  # one per row of the input, NaN where left out
+    alignment: Similarity  # estimate -> reference
+    frames: int  # rows used
+    skipped: int  # rows left out for a NaN or an infinity
+
+
+class Rpe(NamedTuple):
+    """Relative pose error over equal stretches: drift of translation [m] and of rotation [deg]."""
+
+    translation_m: Statistics
+    rotation_deg: Statistics
+    translation_errors_m: Float[np.ndarray, " p"]  # one per pair, NaN where left out
+    rotation_errors_deg: Float[np.ndarray, " p"]
+    pairs: int
+    skipped: int
+
+
+class PoseErrors(NamedTuple):
+    """Errors of camera poses after a similarity; means over views, then one value per row of the input.
+
+    Lengths are in the reference's unit; rows left out for a NaN or an infinity are NaN.
+    """
+
+    rotation_deg: float
+    translation: float  # between world-to-camera translation vectors, as BARF reports it
+    centre: float  # between camera centres
+    rotation_errors_deg: Float[np.ndarray, " n"]
+    translation_errors: Float[np.ndarray, " n"]
+    centre_errors: Float[np.ndarray, " n"]
+    alignment: Similarity  # estimate -> reference
+    frames: int  # rows used
+    skipped: int
+
+
+def umeyama(
+    estimate: Float[np.ndarray, "n 3"], reference: Float[np.ndarray, "n 3"], with_scale: bool
+) -> Similarity:
+    """The rigid map (similarity if `with_scale`) of estimated points closest to reference points.
+
+    Least squares after Umeyama, PAMI 1991; all rows must be finite (DataError otherwise). It is a minimum
+    for any input, but not the only one for points on a line, about which the rotation stays free, nor for
+    points all in one place, where the rotation is then the identity and the scale 1.
+    """
+    if len(estimate) == 0 or not (np.isfinite(estimate).all() and np.isfinite(reference).all()):
+        raise DataError(f"alignment: expected finite points, at least one, got {len(estimate)} rows")
+    center_estimate, estimate = _centered(estimate)
+    center_reference, reference = _centered(reference)
+    covariance = reference.T @ estimate
+    rotation = nearest_rotation(covariance)
+    size = np.sum(estimate**2)
+    scale = float(np.sum(rotation * covariance) / size) if with_scale and size > 0 else 1.0
+    return Similarity(scale, rotation, center_reference - scale * rotation @ center_estimate)
+
+
+def align(alignment: Similarity, T_ref_cam: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 4 4"]:
+    """Move poses by a similarity; centres are scaled, rotations stay rotations."""
+    aligned = np.array(T_ref_cam, np.float64)
+    aligned[:, :3, :3] = alignment.rotation @ T_ref_cam[:, :3, :3]
+    aligned[:, :3, 3] = alignment.scale * T_ref_cam[:, :3, 3] @ alignment.rotation.T + alignment.translation
+    return aligned
+
+
+def align_trajectory(
+    estimate: Float[np.ndarray, "n 4 4"], reference: Float[np.ndarray, "n 4 4"], alignment: Alignment
+) -> Similarity:
+    """The map of estimated camera centres onto the reference: nothing, rigid or with scale, over usable rows.
+
+    DataError where an alignment is asked of fewer than three usable poses: it would fit them perfectly and
+    mean nothing. Centres on a line are aligned; see `umeyama` for what stays free.
+    """
+    used = _usable(estimate, reference)
+    least = 1 if alignment == "none" else 3
+    if used.sum() < least:
+        raise DataError(
+            f"alignment {alignment}: expected at least {least} pairs of finite poses, got {used.sum()}"
+        )
+    if alignment == "none":
+        return Similarity(1.0, np.eye(3), np.zeros(3))
+    return umeyama(estimate[used, :3, 3], reference[used, :3, 3], with_scale=alignment == "sim3")
+
+
+def ate(
+    estimate: Float[np.ndarray, "n 4 4"], reference: Float[np.ndarray, "n 4 4"], alignment: Alignment = "se3"
+) -> Ate:
+    """Absolute trajectory error [m] of matched poses after the named alignment of camera centres.
+
+    DataError on too few usable rows, see `align_trajectory`.
+    """
+    similarity = align_trajectory(estimate, reference, alignment)
+    used = _usable(estimate, reference)
+    errors = np.full(len(used), np.nan)
+    aligned = align(similarity, estimate[used])
+    errors[used] = np.linalg.norm(aligned[:, :3, 3] - reference[used, :3, 3], axis=-1)
+    frames = int(used.sum())
+    return Ate(*statistics(errors), errors, similarity, frames, len(used) - frames)
+
+
+def rpe(
+    estimate: Float[np.ndarray, "n 4 4"],
+    reference: Float[np.ndarray, "n 4 4"],
+    delta: int | float = 1,
+    alignment: Alignment = "se3",
+    *,
+    along: Float[np.ndarray, " n"] | None = None,
+) -> Rpe:
+    """Relative pose error over every pair of frames (i, i + delta), overlapping pairs included.
+
+    With `along`, a number for each row that never decreases, such as its stamp or the path travelled until
+    then (`path_length`), row i is paired with the later row whose number is nearest to along[i] + delta, if
+    that is at most a tenth of `delta` off.
+
+    Motions relative to a frame are free of any rigid alignment, so "none" and "se3" agree; "sim3" scales the
+    estimate first. ValueError for `delta` below 1 frame or not positive, DataError without a usable pair.
+    """
+    if along is None and not (delta >= 1 and delta == int(delta)):
+        raise ValueError(f"rpe: expected delta of at least 1 frame, got {delta}")
+    if not delta > 0:
+        raise ValueError(f"rpe: expected a positive delta, got {delta}")
+    scale = align_trajectory(estimate, reference, "sim3").scale if alignment == "sim3" else 1.0
+    frames = np.arange(float(len(estimate)))
+    first, last = _pairs(frames, delta, 0) if along is None else _pairs(along, delta, 0.1 * delta)
+    usable = _usable(estimate, reference)
+    used = np.logical_and(usable[first], usable[last])
+    if not used.any():
+        apart = "frames apart" if along is None else "apart (within a tenth)"
+        raise DataError(
+            f"relative pose error: expected two finite poses {delta:g} {apart}, got {len(estimate)} poses"
+        )
+    moved, truth = (_relative(T[first[used]], T[last[used]]) for T in (estimate, reference))
+    moved[:, :3, 3] *= scale
+    translation, rotation = np.full((2, len(used)), np.nan)
+    # The error's translation is this difference turned into the reference's last frame: of the same length.
+    translation[used] = np.linalg.norm(moved[:, :3, 3] - truth[:, :3, 3], axis=-1)
+    rotation[used] = rotation_angle_deg(moved[:, :3, :3], truth[:, :3, :3])
+    pairs = int(used.sum())
+    return Rpe(statistics(translation), statistics(rotation), translation, rotation, pairs, len(used) - pairs)
+
+
+def path_length(T_world_cam: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, " n"]:
+    """How far the centre has come until each row [m], straight from one finite pose to the next."""
+    finite = np.isfinite(T_world_cam).all((1, 2))
+    centres = np.asarray(T_world_cam[finite, :3, 3], np.float64)
+    steps = np.linalg.norm(np.diff(centres, axis=0, prepend=centres[:1]), axis=1)
+    come = np.zeros(len(T_world_cam))
+    come[finite] = np.cumsum(steps)
+    return np.maximum.accumulate(come)
+
+
+def procrustes(estimate: Float[np.ndarray, "n 4 4"], reference: Float[np.ndarray, "n 4 4"]) -> Similarity:
+    """The similarity of BARF's evaluation, which maps estimated camera centres onto the reference's.
+
+    Unlike `umeyama` its scale is the ratio of the centres' spreads, so it does not shrink a bad estimate.
+    What the centres leave free (cameras on a line, or all in one place) is settled by the orientations; where
+    the estimate is all in one place the scale is 1. DataError on fewer than three pairs of finite poses.
+    """
+    used = _usable(estimate, reference)
+    if used.sum() < 3:
+        raise DataError(f"pose errors: expected at least 3 pairs of finite poses, got {used.sum()}")
+    estimate, reference = estimate[used], reference[used]
+    center_estimate, points = _centered(estimate[:, :3, 3])
+    center_reference, targets = _centered(reference[:, :3, 3])
+    spread, target_spread = np.sqrt(np.sum(points**2)), np.sqrt(np.sum(targets**2))
+    covariance = targets.T @ points / (spread * target_spread or 1)
+    orientations = np.mean(reference[:, :3, :3] @ estimate[:, :3, :3].swapaxes(1, 2), axis=0)
+    # So faint that it decides only where the centres do not.
+    rotation = nearest_rotation(covariance + 1e-9 * orientations)
+    scale = float(target_spread / spread) if spread > 0 else 1.0
+    return Similarity(scale, rotation, center_reference - scale * rotation @ center_estimate)
+
+
+def pose_errors(estimate: Float[np.ndarray, "n 4 4"], reference: Float[np.ndarray, "n 4 4"]) -> PoseErrors:
+    """Errors of camera-to-world poses after `procrustes`, as BARF (ICCV 2021) evaluates; DataError likewise.
+
+    Angles come from `rotation_angle_deg`; BARF's own formula cannot tell angles below 0.026 degrees from it.
+    A world-to-camera vector turns with the camera, so `translation` also holds a share of the rotation error
+    that grows with the distance to the origin; `centre` does not.
+    """
+    alignment = procrustes(estimate, reference)
+    used = _usable(estimate, reference)
+    aligned, truth = align(alignment, estimate[used]), np.asarray(reference[used], np.float64)
+    rotation, translation, centre = np.full((3, len(used)), np.nan)
+    rotation[used] = rotation_angle_deg(aligned[:, :3, :3], truth[:, :3, :3])
+    vectors = [np.einsum("nji,nj->ni", T[:, :3, :3], T[:, :3, 3]) for T in (aligned, truth)]
+    translation[used] = np.linalg.norm(vectors[0] - vectors[1], axis=-1)
+    centre[used] = np.linalg.norm(aligned[:, :3, 3] - truth[:, :3, 3], axis=-1)
+    means = [float(np.mean(values[used])) for values in (rotation, translation, centre)]
+    frames = int(used.sum())
+    per_view = (rotation, translation, centre)
+    return PoseErrors(
+        means[0],
+        means[1],
+        means[2],
+        *per_view,
+        alignment=alignment,
+        frames=frames,
+        skipped=len(used) - frames,
+    )
+
+
+def statistics(errors: Float[np.ndarray, " n"]) -> Statistics:
+    """Summary of errors, NaN left out; all NaN if nothing is left."""
+    errors = errors[~np.isnan(errors)]
+    if not len(errors):
+        return Statistics(*[float("nan")] * 6)
+    numbers = (
+        np.sqrt(np.mean(errors**2)),
+        errors.mean(),
+        np.median(errors),
+        errors.std(),
+        errors.min(),
+        errors.max(),
+    )
+    return Statistics(*map(float, numbers))
+
+
+def _centered(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "n 3"]]:
+    """Mean and deviations; deviations that are only the mean's rounding (a camera at rest) are zero."""
+    points = np.asarray(points, np.float64)
+    center = points.mean(0)
+    deviations = points - center
+    at_rest = np.abs(deviations).max() <= 1e-13 * np.abs(center).max()
+    return center, np.zeros_like(points) if at_rest else deviations
+
+
+def _usable(
+    estimate: Float[np.ndarray, "n 4 4"], reference: Float[np.ndarray, "n 4 4"]
+) -> Bool[np.ndarray, " n"]:
+    """Rows that are finite in both; DataError for different numbers of rows, which would broadcast."""
+    if estimate.shape != reference.shape:
+        raise DataError(f"trajectories: expected matched poses, got {estimate.shape} and {reference.shape}")
+    return np.asarray(np.isfinite(np.concatenate([estimate, reference], -1)).all((1, 2)))
+
+
+def _pairs(
+    along: Float[np.ndarray, " n"], delta: int | float, tolerance: int | float
+) -> tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"]]:
+    """Rows and their partners about `delta` further along; of equally near ones the first."""
+    after = np.searchsorted(along, along + delta)
+    before = np.searchsorted(along, along[np.maximum(after - 1, 0)])
+    after = np.minimum(after, len(along) - 1)
+    off = [np.asarray(np.abs(along[partner] - along - delta)) for partner in (before, after)]
+    partner = np.where(off[0] <= off[1], before, after)
+    close = (np.minimum(*off) <= tolerance) & (partner > np.arange(len(along)))
+    return np.flatnonzero(close), partner[close]
+
+
+def _relative(
+    T_world_a: Float[np.ndarray, "n 4 4"], T_world_b: Float[np.ndarray, "n 4 4"]
+) -> Float[np.ndarray, "n 4 4"]:
+    """T_a_b of rigid poses."""
+    R_a_world = np.asarray(T_world_a, np.float64)[:, :3, :3].swapaxes(-1, -2)
+    T_a_b = np.tile(np.eye(4), (len(T_world_a), 1, 1))
+    T_a_b[:, :3, :3] = R_a_world @ T_world_b[:, :3, :3]
+    T_a_b[:, :3, 3] = np.einsum("nij,nj->ni", R_a_world, T_world_b[:, :3, 3] - T_world_a[:, :3, 3])
+    return T_a_b

@@ -1,0 +1,1 @@
+"""NeRF from events: `python -m jaxpose.experiments.event_nerf`."""

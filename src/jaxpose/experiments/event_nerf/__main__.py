@@ -1,0 +1,5 @@
+"""`python -m jaxpose.experiments.event_nerf`."""
+
+from jaxpose.experiments.event_nerf.pipeline import main
+
+main()

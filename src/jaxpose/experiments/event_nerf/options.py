@@ -1,0 +1,224 @@
+"""Options of the event experiment, and the events and inexact poses that they name."""
+
+import math
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.distance import pdist
+from scipy.spatial.transform import Rotation
+
+from jaxpose.datasets.events import registry as event_registry
+from jaxpose.datasets.synthetic import event_orbit
+from jaxpose.datasets.synthetic.orbit import DIAMETER, FAR, NEAR
+from jaxpose.datasets.types import EventRecording
+from jaxpose.errors import DataError
+from jaxpose.events import Mosaic
+from jaxpose.events.contrast import find_slide
+from jaxpose.experiments.command import check_least, check_resume
+from jaxpose.experiments.training_loop import CHUNK, NetConfig
+from jaxpose.files.trajectories import Trajectory
+from jaxpose.training.events import Loss
+from jaxpose.training.photometric import Depths
+
+Pose = Literal["posenet", "linear"]
+Study = Literal["known", "offset"]
+ORBIT = Path("orbit")
+_WIDTH, _SMOKE_WIDTH, _SMOKE_POSES = 100, 16, 60
+_KNOWN = 10
+
+
+@dataclass(frozen=True)
+class Config:
+    """Settings of a run; the events and these are all that a result depends on."""
+
+    # A folder or file of events (EventNeRF, DAVIS text, HDF5, npz); "orbit": a turntable made on the fly.
+    data: Path = ORBIT
+    pose: Pose = "posenet"  # the trajectory is refined by a PoseNet, or stays as it starts
+    loss: Loss = "asynchronous"  # each event at its own time, or EventNeRF's windows
+    preset: Literal["fast", "paper"] = (
+        "fast"  # a small network for CPUs, or the sizes of EventNeRF and the paper
+    )
+    # "unknown": nothing is known of the poses; the start is the steady slide along the image that makes the
+    # events sharpest, so that the recording must be short, and lengths are in typical depths.
+    poses: Literal["known", "unknown"] = "known"
+    # Instants at which positions are known, straight lines between; orientations are kept. None: all that the
+    # data have; the orbit's default is 10, unless its axis is wrong.
+    known: int | None = None
+    axis_offset_deg: float = 0.0  # the turntable's axis, as the camera sees it, is wrong by this
+    threshold: float | None = None  # change of log intensity per event; None: what the data tell, or 0.25
+    mosaic: Mosaic | None = None  # the sensor's colours; None: what the data tell
+    image_width: int | None = None  # [px] of the orbit's sensor; None: 100
+    seed: int = 0  # of the orbit's paint and noise, the network's start, the events drawn
+    steps: int | None = None  # None: 3000, with preset paper 200,000
+    events: int | None = None  # per step; None: 512, with preset paper 1024
+    net: NetConfig = NetConfig()
+    study: Study | None = None  # table 4 (known: 20, 10 and 6 instants), or offsets, both fields side by side
+    resume: bool = False  # go on where a killed run stopped
+    smoke: bool = False  # everything shrunk to seconds; the numbers then mean nothing
+    out: Path | None = None  # exactly this folder; None: outputs/event_nerf/<name or time stamp>
+    name: str | None = None  # of the run folder
+
+    def __post_init__(self):
+        check_least(self, known=2, axis_offset_deg=0, seed=0, image_width=8, steps=CHUNK, events=1)
+        if self.threshold is not None and not 0 < self.threshold < math.inf:
+            raise ValueError(f"--threshold: expected a positive number, got {self.threshold}")
+        if self.axis_offset_deg >= 45:
+            raise ValueError(f"--axis-offset-deg: expected less than 45, got {self.axis_offset_deg:g}")
+        if self.steps is not None and self.steps % CHUNK:
+            raise ValueError(f"--steps: expected a multiple of {CHUNK}, got {self.steps}")
+        if self.poses == "unknown" and (self.known is not None or self.axis_offset_deg):
+            raise ValueError("--poses unknown: expected neither --known nor --axis-offset-deg with it")
+        if self.poses == "unknown" and self.data == ORBIT:
+            raise ValueError("--poses unknown: expected --data with a short recording, got the orbit")
+        check_resume(self)
+
+
+# What a run's numbers do not depend on.
+_INCIDENTAL = ("resume", "out", "name", "study")
+
+
+def decisive(config: Config) -> dict[str, Any]:
+    """The settings that a resumed run must share with the one it resumes."""
+    return {f.name: getattr(config, f.name) for f in fields(config) if f.name not in _INCIDENTAL}
+
+
+class Problem(NamedTuple):
+    """Events, and stamped poses that the training starts from."""
+
+    recording: EventRecording
+    start: Trajectory
+    span: tuple[float, float]  # [s] events are used, and poses asked for
+    threshold: float
+    depths: Depths
+    background: float | None
+    extent: float  # how far the camera moves [scene units]
+    slides: bool  # whether nothing is known but that it slides
+    about: dict[str, Any]  # the data and what is wrong with the poses, in words and numbers
+
+
+def load(config: Config) -> Problem:
+    """The events, and the poses to start from: `begin` with what `read` has read."""
+    return begin(config, read(config))
+
+
+def read(config: Config) -> EventRecording:
+    """Read or make the events. DataError or OSError for what cannot be used."""
+    if config.data == ORBIT:
+        width = _SMOKE_WIDTH if config.smoke else config.image_width or _WIDTH
+        poses = _SMOKE_POSES if config.smoke else 1000
+        return event_orbit.event_orbit(width, config.seed, poses=poses, mosaic=config.mosaic or "rggb")
+    return event_registry.load(config.data, mosaic=config.mosaic)
+
+
+def begin(config: Config, recording: EventRecording) -> Problem:
+    """What of the recording's poses the training is told. DataError where it cannot be told."""
+    orbiting = config.data == ORBIT
+    if len(recording.events.t) == 0:
+        raise DataError(f"{config.data}: expected events, got none")
+    began = _unknown(recording) if config.poses == "unknown" else _known(config, recording, orbiting)
+    t = recording.events.t
+    span = float(max(t[0], began.start.t[0])), float(min(t[-1], began.start.t[-1]))
+    if not span[0] < span[1]:
+        raise DataError(
+            f"{config.data}: expected poses during the events, 0 to {t[-1]:.4g} s, got some from "
+            f"{began.start.t[0]:.4g} to {began.start.t[-1]:.4g} s"
+        )
+    camera = recording.camera
+    about = {
+        "data": "synthetic orbit with events" if orbiting else recording.name,
+        "events": len(recording.events.t),
+        "span_s": float(np.ptp(recording.events.t)),
+        "size": (camera.width, camera.height),
+        "mosaic": recording.mosaic,
+        "extent": began.extent,
+        "poses": began.words,
+        "notes": recording.notes,
+    }
+    threshold = config.threshold or recording.threshold or 0.25
+    background = event_orbit.BACKGROUND if recording.cyclic else None  # EventNeRF's, for its turntables
+    return Problem(
+        recording,
+        began.start,
+        span,
+        threshold,
+        began.depths,
+        background,
+        began.extent,
+        config.poses == "unknown",
+        about,
+    )
+
+
+class _Began(NamedTuple):
+    """Where a training starts, and how large the scene is."""
+
+    start: Trajectory
+    depths: Depths
+    extent: float
+    words: str
+
+
+def _unknown(recording: EventRecording) -> _Began:
+    """The slide that makes events sharpest, from the middle of the time at the world's origin."""
+    slide = find_slide(recording.camera, recording.events)
+    ends = recording.events.t[[0, -1]]
+    T_start = np.tile(np.eye(4), (2, 1, 1))
+    T_start[:, :3, 3] = (ends - ends.mean())[:, None] * slide.velocity
+    depths = 1 / slide.inverse_depth
+    x, y, _ = slide.velocity
+    words = (
+        f"poses unknown: starts as a steady slide of ({x:.3g}, {y:.3g}) typical depths a second, by contrast"
+    )
+    return _Began(
+        Trajectory(ends, T_start),
+        Depths(0.6 * float(depths.min()), 2 * float(depths.max()), "disparity"),
+        float(np.linalg.norm(T_start[1, :3, 3] - T_start[0, :3, 3])),
+        words,
+    )
+
+
+def _known(config: Config, recording: EventRecording, orbiting: bool) -> _Began:
+    """The recording's poses with what is said to be wrong with them."""
+    if len(recording.t) < 2:
+        raise DataError(
+            f"{config.data}: expected poses at 2 instants or more, or --poses unknown, got {len(recording.t)}"
+        )
+    known = config.known
+    if known is None and orbiting and not config.axis_offset_deg:
+        known = _KNOWN
+    if known is not None and known > len(recording.t):
+        raise DataError(f"--known: expected at most the {len(recording.t)} poses of the data, got {known}")
+    T_start, words = _inexact(recording, known, config.axis_offset_deg)
+    centres = recording.T_world_cam[:, :3, 3]
+    extent = DIAMETER if orbiting else float(pdist(centres[:: max(1, len(centres) // 200)]).max())
+    if orbiting:
+        depths = Depths(NEAR, FAR)
+    elif recording.held_out is not None:
+        depths = Depths(recording.held_out.near, recording.held_out.far)
+    else:  # EventNeRF's rule: the scene lies in the unit sphere about the world's origin
+        distance = np.linalg.norm(centres, axis=1)
+        depths = Depths(max(distance.min() - 1, 0.05 * distance.min()), distance.max() + 1)
+    return _Began(Trajectory(recording.t, T_start), depths, extent, words)
+
+
+def _inexact(
+    recording: EventRecording, known: int | None, offset_deg: float
+) -> tuple[Float[np.ndarray, "k 4 4"], str]:
+    """The recording's poses with positions on straight lines between known ones, about a wrong axis."""
+    truth, t = recording.T_world_cam, recording.t
+    T_start, words = truth.copy(), [f"known at all {len(t)} instants"]
+    if known is not None:
+        at = np.round(np.linspace(0, len(t) - 1, known + recording.cyclic)).astype(int)
+        for axis in range(3):
+            T_start[:, axis, 3] = np.interp(t, t[at], truth[at, axis, 3])
+        words = [f"positions known at {known} instants, linear between, orientations kept"]
+    if offset_deg:
+        # All that a camera knows of a turntable is where it sees the axis: turned about its own y axis.
+        T_start[:, :3, :3] = (
+            T_start[:, :3, :3] @ Rotation.from_euler("y", offset_deg, degrees=True).as_matrix()
+        )
+        words.append(f"axis wrong by {offset_deg:g} degrees about the camera's y axis")
+    return T_start, ", ".join(words)

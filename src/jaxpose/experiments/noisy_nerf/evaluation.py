@@ -1,0 +1,112 @@
+"""How good a training is: pose errors against the truth, held-out views with and without settling them."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, PRNGKeyArray
+
+from jaxpose.evaluation import trajectory_error
+from jaxpose.experiments.image_metrics import likeness, means, pose_numbers
+from jaxpose.experiments.noisy_nerf.options import Config, Problem
+from jaxpose.experiments.noisy_nerf.setup import Setup
+from jaxpose.fields import set_progress
+from jaxpose.geometry.rigid import Similarity
+from jaxpose.plots.nerf import HeldOut
+from jaxpose.training import photometric
+from jaxpose.training.photometric import Viewer
+from jaxpose.training.steps import State
+
+PROTOCOL = {
+    "alignment": "similarity that maps estimated camera centres to the true ones (scale: ratio of spreads), "
+    "as in BARF",
+    "rotation_error_deg": "angle to the true orientation after alignment, mean over the training views",
+    "translation_error": "distance of world-to-camera translation vectors after alignment, mean over the "
+    "training views, as BARF defines it [scene units]",
+    "centre_error": "distance of camera centres after alignment, mean over training views [scene units]",
+    "psnr, ssim, lpips": "mean over the held-out views, their true poses brought into the estimate's frame "
+    "by the alignment; settled: after test-time optimisation of each pose on its photograph",
+}
+
+
+class Measured(NamedTuple):
+    """The numbers, the held-out views to draw, and poses aligned with the truth."""
+
+    numbers: dict[str, Any]
+    views: list[HeldOut]
+    T_start: Float[np.ndarray, "n 4 4"]
+    T_estimate: Float[np.ndarray, "n 4 4"]
+    alignment: Similarity  # of the latter
+
+
+def measure(
+    config: Config, problem: Problem, setup: Setup, state: State, T_world_cam: Float[np.ndarray, "n 4 4"]
+) -> Measured:
+    """Errors of the trained poses, and of what the scene shows from held-out ones."""
+    truth = problem.train.T_world_cam
+    errors = trajectory_error.pose_errors(T_world_cam, truth)
+    at_start = trajectory_error.pose_errors(problem.T_start, truth)
+    to_estimate = trajectory_error.procrustes(truth, T_world_cam)
+    viewer = photometric.viewer(
+        setup.scene,
+        problem.train.camera,
+        setup.depths,
+        setup.train,
+        settle_steps=config.settle_steps,
+        settle_rate=setup.settle_rate,
+    )
+    scene = set_progress(state.scene, jnp.ones(()))
+    keys = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), 1), len(problem.held_out.t))
+    as_aligned, as_settled, views = [], [], []
+    for index, key in enumerate(keys):
+        pose = trajectory_error.align(to_estimate, problem.held_out.T_world_cam[index : index + 1])[0]
+        image, view = _seen(viewer, scene, problem, index, pose)
+        as_aligned.append(image)
+        views.append(view)
+        if config.settle_steps:
+            as_settled.append(_settled(viewer, scene, problem, index, pose, key))
+    numbers = {
+        **pose_numbers(errors, problem.extent),
+        **means(as_aligned),
+        "settled": means(as_settled) if as_settled else None,
+        "start": pose_numbers(at_start, problem.extent),
+        "largest": {
+            "rotation_error_deg": np.nanmax(errors.rotation_errors_deg),
+            "translation_error": np.nanmax(errors.translation_errors),
+        },
+        "held_out": as_aligned,
+    }
+    return Measured(
+        numbers,
+        views,
+        trajectory_error.align(at_start.alignment, problem.T_start),
+        trajectory_error.align(errors.alignment, T_world_cam),
+        errors.alignment,
+    )
+
+
+def _settled(
+    viewer: Viewer,
+    scene: Any,
+    problem: Problem,
+    index: int,
+    pose: Float[np.ndarray, "4 4"],
+    key: PRNGKeyArray,
+) -> dict[str, float | None]:
+    rgb = jnp.asarray(problem.held_out.rgb[index])
+    moved = viewer.settle(scene, jnp.asarray(pose, jnp.float32), rgb, key)
+    return _seen(viewer, scene, problem, index, np.asarray(moved, np.float64))[0]
+
+
+def _seen(
+    viewer: Viewer, scene: Any, problem: Problem, index: int, pose: Float[np.ndarray, "4 4"]
+) -> tuple[dict[str, float | None], HeldOut]:
+    """A held-out photograph rendered from a pose: how alike they are, and both."""
+    rgb, depth = viewer.image(scene, jnp.asarray(pose, jnp.float32))
+    rendered = np.clip(np.asarray(rgb, np.float64), 0, 1)
+    photograph = problem.held_out.rgb[index]
+    label = problem.held_out.files[index]
+    return likeness(rendered, photograph / 255), HeldOut(
+        label, photograph, rendered, np.asarray(depth, np.float64)
+    )

@@ -1,0 +1,177 @@
+"""Options of the noisy-pose experiment, and the photographs and disturbed poses that they name."""
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.distance import pdist
+
+from jaxpose.datasets.photos import blender, llff
+from jaxpose.datasets.synthetic import pose_noise
+from jaxpose.datasets.synthetic.orbit import DIAMETER, orbit
+from jaxpose.datasets.types import Photographs, every, take
+from jaxpose.errors import DataError
+from jaxpose.experiments.command import check_least, check_resume
+from jaxpose.experiments.training_loop import CHUNK, NetConfig
+
+Pose = Literal["posenet", "table", "bspline", "spline_reset"]
+Study = Literal["fields", "encoding", "size", "spline", "ablations"]
+ORBIT = Path("orbit")
+_WIDTHS = {"fast": 100, "paper": 400}  # [px]
+_SMOKE_WIDTH, _SMOKE_VIEWS = 24, 8
+
+
+@dataclass(frozen=True)
+class Config:
+    """Settings of a run; photographs and these are all that a result depends on."""
+
+    # A folder in the layout of Blender, nerfstudio, instant-ngp or LLFF; "orbit": an object made on the fly.
+    data: Path = ORBIT
+    pose: Pose = (
+        "posenet"  # the pose field; spline_reset: a table, reset to a smoothing spline every 100 steps
+    )
+    preset: Literal["fast", "paper"] = "fast"  # a small network for CPUs, or BARF's with the paper's schedule
+    # Of the poses that the run starts from. "none": as the data has them; "unknown": all in one place.
+    noise: Literal["correlated", "independent", "none", "unknown"] = "correlated"
+    noise_translation: float = 0.2  # largest deviation, as a share of the largest distance between cameras
+    noise_rotation_deg: float = 0.0  # largest deviation
+    noise_sigma: float = 0.15  # of independent noise, BARF's [rad and scene units]
+    # Which side of the camera's pose the noise is on, and the field that undoes it: the supplement's formula
+    # has the world's, where turning goes about the world's origin; on the camera's it turns out of view.
+    side: Literal["world", "camera"] = "world"
+    every: int = 1  # use every n-th training image
+    image_width: int | None = None  # [px] images are reduced to; None: 100, with preset paper 400
+    orbit_views: int = 100
+    seed: int = 0  # of the noise, the network's start, the rays
+    steps: int | None = None  # None: 5000, with preset paper 200,000
+    rays: int | None = None  # per step; None: 1024, with preset paper 4096
+    net: NetConfig = NetConfig()
+    spline_knots: int = 25  # of both splines
+    spline_smoothing: float = 1e-3  # of spline_reset: scipy's bound on the sum of squares, per dimension
+    settle_steps: int = 100  # of the test-time optimisation of held-out poses; 0: none
+    study: Study | None = None  # runs of table 11 (fields), 3 (encoding), 12 (size), 10 (spline) side by side
+    resume: bool = False  # go on where a killed run stopped
+    smoke: bool = False  # everything shrunk to seconds; the numbers then mean nothing
+    out: Path | None = None  # exactly this folder; None: outputs/noisy_nerf/<name or time stamp>
+    name: str | None = None  # of the run folder
+
+    def __post_init__(self):
+        check_least(
+            self,
+            noise_translation=0, noise_rotation_deg=0, noise_sigma=0, seed=0, settle_steps=0,
+            spline_smoothing=0, every=1, orbit_views=4, image_width=8, steps=CHUNK, rays=1, spline_knots=2,
+        )  # fmt: skip
+        if self.spline_smoothing == 0:
+            raise ValueError("--spline-smoothing: expected a positive number, got 0")
+        if self.noise_rotation_deg > 180:
+            raise ValueError(f"--noise-rotation-deg: expected at most 180, got {self.noise_rotation_deg:g}")
+        if self.steps is not None and self.steps % CHUNK:
+            raise ValueError(f"--steps: expected a multiple of {CHUNK}, got {self.steps}")
+        check_resume(self)
+
+
+# What a run's numbers do not depend on.
+_INCIDENTAL = ("resume", "out", "name", "study")
+
+
+def decisive(config: Config) -> dict[str, Any]:
+    """The settings that a resumed run must share with the one it resumes."""
+    return {f.name: getattr(config, f.name) for f in fields(config) if f.name not in _INCIDENTAL}
+
+
+class Problem(NamedTuple):
+    """Photographs to train on and held out, and the poses that the training starts from."""
+
+    train: Photographs
+    held_out: Photographs
+    T_start: Float[np.ndarray, "n 4 4"]  # camera-to-world
+    extent: float  # largest distance between true cameras [scene units]
+    about: dict[str, Any]  # the data and the noise in words and numbers
+
+
+def load(config: Config) -> Problem:
+    """Read or make the photographs and disturb their poses.
+
+    DataError or OSError for what cannot be used.
+    """
+    train, held_out = _photographs(config)
+    train = every(train, config.every)
+    if len(train.t) < 4:
+        raise DataError(f"{config.data}: expected at least 4 images to train on, got {len(train.t)}")
+    extent = DIAMETER if config.data == ORBIT else float(pdist(train.T_world_cam[:, :3, 3]).max())
+    T_start, words = _disturbed(config, train, extent)
+    about = {
+        "data": "synthetic orbit" if config.data == ORBIT else train.name,
+        "images": len(train.t),
+        "held_out": len(held_out.t),
+        "size": (train.camera.width, train.camera.height),
+        "extent": extent,
+        "noise": words,
+        "notes": train.notes,
+    }
+    return Problem(train, held_out, T_start, extent, about)
+
+
+def _photographs(config: Config) -> tuple[Photographs, Photographs]:
+    width = _SMOKE_WIDTH if config.smoke else config.image_width or _WIDTHS[config.preset]
+    if config.data == ORBIT:
+        return orbit(_SMOKE_VIEWS if config.smoke else config.orbit_views, width)
+    if not config.data.exists():
+        raise DataError(f"{config.data}: expected a folder of photographs, or orbit, got nothing")
+    if (config.data / "poses_bounds.npy").is_file():
+        train, held_out = llff.load(config.data, width=width)
+    elif config.data.is_dir() and not any(config.data.glob("transforms*.json")):
+        raise DataError(
+            f"{config.data}: expected transforms_train.json or transforms.json (Blender, nerfstudio, "
+            "instant-ngp) or poses_bounds.npy (LLFF), got none of them"
+        )
+    else:
+        train, held_out = blender.load(config.data, width=width)
+    if config.smoke:
+        train, held_out = (
+            take(train, np.arange(min(_SMOKE_VIEWS, len(train.t)))),
+            take(held_out, np.arange(1)),
+        )
+    return train, held_out
+
+
+def _middle(photographs: Photographs) -> float:
+    """Depth of the middle of the scene, where a world that is not known yet has its origin.
+
+    Turns on the world's side then go about what the cameras look at. About the cameras themselves, turning
+    and moving shift an image alike, the scene explains away what differs, and the poses do not come apart.
+    """
+    near, far = photographs.near, photographs.far
+    return 2 / (1 / near + 1 / far) if photographs.spacing == "disparity" else (near + far) / 2
+
+
+def _disturbed(config: Config, train: Photographs, extent: float) -> tuple[Float[np.ndarray, "n 4 4"], str]:
+    """The poses to start from, and what was done to them."""
+    truth = train.T_world_cam
+    if config.noise == "none":
+        return truth, "none: the poses of the data"
+    if config.noise == "unknown":
+        T_same = np.tile(np.eye(4), (len(truth), 1, 1))
+        T_same[:, 2, 3] = -_middle(train)
+        return T_same, "poses unknown: all start in one place"
+    if config.noise == "independent":
+        T_noise = pose_noise.independent(len(truth), config.noise_sigma, config.seed)
+        words = f"independent, twists of N(0, {config.noise_sigma:g}^2) [scene units and rad]"
+    else:
+        T_noise = pose_noise.correlated(
+            train.t,
+            translation=config.noise_translation * extent,
+            rotation_deg=config.noise_rotation_deg,
+            seed=config.seed,
+        )
+        words = (
+            f"correlated, at most {100 * config.noise_translation:g}% of the cameras' extent "
+            f"and {config.noise_rotation_deg:g} degrees"
+        )
+    words += f", on the {config.side}'s side, seed {config.seed}"
+    if config.side == "camera":
+        return truth @ T_noise, words
+    # World-to-camera this is T_c,w . T_noise, as in the supplement's section 6.
+    return np.linalg.inv(T_noise) @ truth, words

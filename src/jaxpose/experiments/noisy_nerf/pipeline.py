@@ -1,0 +1,189 @@
+"""NeRF from noisy or unknown poses: a scene and the cameras' trajectory optimised together from photographs.
+
+Without options: 100 views of an object on an orbit made on the fly, poses disturbed by smooth noise of 20%
+of the orbit's diameter, PoseNet against it, a run folder under outputs/noisy_nerf. `--data DIR` reads
+photographs with poses (Blender, nerfstudio, instant-ngp, LLFF). `--study fields` puts all pose fields side
+by side.
+"""
+
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as imageio
+import numpy as np
+from jaxtyping import Float
+
+from jaxpose.datasets.photos import blender
+from jaxpose.datasets.photos.transforms_json import write_transforms
+from jaxpose.experiments import command, training_loop
+from jaxpose.experiments.noisy_nerf.evaluation import PROTOCOL, Measured, measure
+from jaxpose.experiments.noisy_nerf.options import ORBIT, Config, Problem, decisive, load
+from jaxpose.experiments.noisy_nerf.report import progress_bar, report, table
+from jaxpose.experiments.noisy_nerf.setup import Setup, build, describe, splined
+from jaxpose.experiments.noisy_nerf.studies import STUDIES
+from jaxpose.experiments.training_loop import Loaded, OnProgress, Outcome, Trained
+from jaxpose.fields.serialization import write_field
+from jaxpose.files import atomic, run_folder, trajectories
+from jaxpose.files.camera_json import write_camera
+from jaxpose.plots import nerf as nerf_plots
+from jaxpose.plots.nerf import History
+
+
+def run(config: Config, on_progress: OnProgress | None = None) -> Outcome:
+    """Train, measure and write the run folder; `resume` goes on where a killed run stopped.
+
+    Raises DataError or OSError for what cannot be used; then no folder is left behind.
+    """
+    started = time.perf_counter()
+    problem = load(config)
+    folder = run_folder.run_folder("noisy_nerf", name=config.name, out=config.out)
+    if config.study is None:
+        return Outcome(folder, _single(config, problem, folder, on_progress, ""))
+    results, histories = {}, {}
+    for label, changed in STUDIES[config.study](config).items():
+        inner = folder / label
+        inner.mkdir(exist_ok=True)
+        results[label] = _single(replace(changed, study=None), problem, inner, on_progress, label)
+        histories[label] = _history(np.array(results[label]["history"], float))
+    nerf_plots.curves(folder / "curves.png", histories, f"{_title(problem)}: {config.study}")
+    return training_loop.write_study(folder, "noisy_nerf", config, results, table(results), started)
+
+
+def train(
+    config: Config,
+    problem: Problem,
+    setup: Setup,
+    checkpoint: Path,
+    on_progress: OnProgress | None,
+    label: str,
+) -> Trained:
+    """Train to the end, from the checkpoint if there is one, and keep one as it goes."""
+    poses = training_loop.pose_reader(setup.field, problem.train.t)
+
+    def between(state):
+        if config.pose != "spline_reset":
+            return state
+        smooth = splined(state.pose, problem.train.t, config.spline_knots, config.spline_smoothing)
+        return state._replace(pose=smooth)
+
+    return training_loop.train(
+        setup,
+        training_loop.fresh(setup, config.seed),
+        setup.views,
+        lambda params: training_loop.mean_errors(poses(params), problem.train.T_world_cam),
+        checkpoint,
+        on_progress,
+        label=label,
+        extent=problem.extent,
+        between=between,
+    )
+
+
+def load_run(folder: Path | str) -> Loaded[Problem, Setup]:
+    """What a run has left in its folder, as `joint_loop.load_run`."""
+    return training_loop.load_run(folder, Config, load, build)
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """The command: `python -m jaxpose.experiments.noisy_nerf`."""
+    config = command.parse("noisy_nerf", Config, __doc__, args)
+    command.guarded("noisy_nerf", lambda: report(*run(config, progress_bar())))
+
+
+def _single(
+    config: Config, problem: Problem, folder: Path, on_progress: OnProgress | None, label: str
+) -> dict[str, Any]:
+    """One training, measured and written; what a killed or finished run has left is used with `resume`."""
+    started = time.perf_counter()
+    checkpoint, finished = folder / "checkpoint.npz", folder / "results.json"
+    training_loop.prepare(folder, config, decisive(config), resume=config.resume)
+    if finished.exists():
+        return json.loads(finished.read_text())
+    setup = build(config, problem)
+    trained = train(config, problem, setup, checkpoint, on_progress, label)
+    T_world_cam = training_loop.pose_reader(setup.field, problem.train.t)(trained.state.pose)
+    measured = measure(config, problem, setup, trained.state, T_world_cam)
+    _draw(folder, config, problem, measured, trained)
+    _write_poses(folder, config, problem, measured)
+    span = (float(problem.train.t[0]), float(problem.train.t[-1]))
+    factors = setup.factors(trained.state.pose)
+    write_field(folder / "field.npz", span, factors, alignment=measured.alignment)
+    results = training_loop.results_of(
+        "noisy_nerf",
+        config,
+        trained,
+        started,
+        data=problem.about,
+        training=describe(config, setup),
+        protocol=PROTOCOL,
+        **measured.numbers,
+    )
+    atomic.write_json(finished, results)  # last: with it the run counts as finished
+    return results
+
+
+def _draw(folder: Path, config: Config, problem: Problem, measured: Measured, trained: Trained) -> None:
+    numbers, title = measured.numbers, _title(problem)
+    found = (
+        f"{config.pose}: rotation {numbers['start']['rotation_error_deg']:.2f} to "
+        f"{numbers['rotation_error_deg']:.3f} deg, translation "
+        f"{numbers['start']['translation_error_percent']:.2f} to "
+        f"{numbers['translation_error_percent']:.3f}% of the cameras' extent"
+    )
+    truth = problem.train.T_world_cam
+    nerf_plots.cameras(
+        folder / "cameras.png", truth, measured.T_start, measured.T_estimate, f"{title}\n{found}"
+    )
+    psnr = f"{config.pose}, held-out PSNR {numbers['psnr']:.2f} dB"
+    nerf_plots.held_out(folder / "held_out.png", measured.views, f"{title}\n{psnr}")
+    nerf_plots.curves(folder / "curves.png", {config.pose: _history(trained.history)}, f"{title}\n{found}")
+
+
+def _write_poses(folder: Path, config: Config, problem: Problem, measured: Measured) -> None:
+    """The refined poses, aligned with the data's own world, as a trajectory and as transforms.json."""
+    photographs = problem.train
+    refined = photographs._replace(T_world_cam=measured.T_estimate)
+    trajectories.write_tum(
+        folder / "trajectory.txt", trajectories.Trajectory(photographs.t, measured.T_estimate)
+    )
+    trajectories.write_tum(
+        folder / "reference.txt", trajectories.Trajectory(photographs.t, photographs.T_world_cam)
+    )
+    with atomic.atomic(folder / "start.npz") as temporary:
+        np.savez(temporary, t=photographs.t, T_world_cam=problem.T_start)
+    images_folder = "." if config.data == ORBIT else _images_folder(config.data).resolve()
+    write_camera(folder / "camera.json", photographs.camera, photographs.files, images_folder)
+    if config.data == ORBIT:  # its images are on no disk yet
+        for part in (photographs, problem.held_out):
+            for name, rgb in zip(part.files, part.rgb, strict=True):
+                (folder / name).parent.mkdir(exist_ok=True)
+                imageio.imwrite(folder / name, rgb)
+        write_transforms(folder / "transforms_test.json", problem.held_out)
+        write_transforms(folder / "transforms_train.json", refined)
+    elif (config.data / "poses_bounds.npy").is_file():
+        write_transforms(folder / "transforms.json", refined)
+    else:
+        write_transforms(folder / "transforms.json", refined, source=blender.transforms_file(config.data))
+
+
+def _images_folder(data: Path) -> Path:
+    """The folder that the names of the images are relative to."""
+    if (data / "poses_bounds.npy").is_file():
+        return data
+    return blender.transforms_file(data).parent
+
+
+def _title(problem: Problem) -> str:
+    width, height = problem.about["size"]
+    about = problem.about
+    return f"{about['data']}, {about['images']} views of {width}x{height}\nnoise {about['noise']}"
+
+
+def _history(rows: Float[np.ndarray, "c 5"]) -> History:
+    """For a picture: with the PSNR that a mean squared colour error is."""
+    step, loss, rotation_deg, translation, _ = rows.T
+    return History(step.astype(int), loss, -10 * np.log10(loss), rotation_deg, translation)

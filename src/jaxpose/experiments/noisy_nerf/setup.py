@@ -1,0 +1,173 @@
+"""What is trained in the noisy-pose experiment: scene, pose field, their rates, by preset and name."""
+
+import warnings
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.interpolate import make_splrep
+
+from jaxpose import fields
+from jaxpose.experiments.noisy_nerf.options import Config, Problem
+from jaxpose.experiments.training_loop import CHUNK
+from jaxpose.fields import Params, PoseField, PoseNetConfig
+from jaxpose.fields.serialization import Factor, bspline_factor, posenet_factor, stamped_factor, table_factor
+from jaxpose.scenes import NerfConfig, SceneField, nerf
+from jaxpose.training.photometric import Depths, TrainConfig, Views, trainer
+from jaxpose.training.steps import Rate, Trainer
+
+_FAST_SCENE = NerfConfig(
+    layers=4, width=96, skip=2, colour_width=48, octaves=7, window=(0.15, 0.5), quiet=True
+)
+_SMOKE_SCENE = NerfConfig(layers=2, width=16, skip=None, colour_width=8, octaves=4, window=(0.1, 0.5))
+_FAST = TrainConfig(steps=5000, rays=1024, samples=32, chunk=64)
+_PAPER = TrainConfig(steps=200_000, rays=4096, samples=128, chunk=32)
+_SMOKE = TrainConfig(steps=CHUNK, rays=64, samples=8, chunk=32)
+# In short trainings on poses far off: first a blurred scene forms, then the cameras move to where it is seen,
+# then they turn. Free at once, they run after a scene that does not exist yet, and do not come back.
+_SHIFT_FROM, _TURN_FROM = 0.03, 0.06  # shares of the training
+# Parallax alone tells how cameras in one place have turned, and a blurred scene does not show it.
+_UNKNOWN_WINDOW = (0.0, 0.05)
+# Adam's first and last rate for translation and rotation, by how the training goes.
+_NET_RATES = {
+    "paper": ((1e-3, 1e-5), (2e-4, 1e-6)),
+    "noisy": ((3e-4, 2e-5), (3e-4, 2e-5)),
+    "unknown": ((6e-4, 4e-5), (2e-3, 1e-4)),
+}
+_TABLE_RATES = {  # also of splines; with preset paper BARF's
+    "noisy": ((3e-3, 1e-4), (3e-3, 1e-4)),
+    "unknown": ((2e-3, 1e-4), (6e-3, 3e-4)),
+}
+_BARF_SETTLE = {"depth": 1e-3, "disparity": 3e-3}  # BARF's rate of test-time poses, Blender and LLFF
+
+
+class Setup(NamedTuple):
+    """A scene and a pose field (camera-to-world), and how to train them."""
+
+    scene: SceneField
+    field: PoseField
+    factors: Callable[[Params], tuple[Factor, ...]]  # of the field, for `io_field.write_field`
+    scene_rates: Rate
+    pose_rates: Any
+    train: TrainConfig
+    depths: Depths
+    views: Views
+    trainer: Trainer
+    settle_rate: float
+
+
+def build(config: Config, problem: Problem) -> Setup:
+    """Scene, pose field and rates that the config names, for these photographs."""
+    photographs, paper = problem.train, config.preset == "paper"
+    barf = photographs.spacing
+    if config.smoke:
+        scene, train = nerf(_SMOKE_SCENE), _SMOKE
+    else:
+        scene, train = (nerf(), _PAPER) if paper else (nerf(_fast_scene(config)), _FAST)
+        train = replace(train, steps=config.steps or train.steps, rays=config.rays or train.rays)
+    if not paper:
+        scene_rates = Rate(1e-3, 1e-4)
+    else:
+        scene_rates = Rate(5e-4, 1e-4) if barf == "depth" else Rate(1e-3, 1e-4)
+    t = jnp.asarray(photographs.t, jnp.float32)
+    field, factor, rates = _field(config, problem)
+    T_start = jnp.asarray(problem.T_start, jnp.float32)
+    start = stamped_factor(t, T_start)
+    world = config.side == "world"
+    field = fields.refine(field, fields.stamped(t, T_start), side="world" if world else "body")
+    depths = Depths(photographs.near, photographs.far, photographs.spacing)
+    return Setup(
+        scene,
+        field,
+        lambda params: (factor(params), start) if world else (start, factor(params)),
+        scene_rates,
+        rates,
+        train,
+        depths,
+        Views(t, jnp.asarray(photographs.rgb)),
+        trainer(scene, field, photographs.camera, depths, scene_rates, rates, train),
+        _BARF_SETTLE[barf],
+    )
+
+
+def splined(
+    params: Float[Array, "n 6"], t: Float[np.ndarray, " n"], knots: int, smoothing: float
+) -> Float[Array, "n 6"]:
+    """A table reset to scipy's cubic smoothing spline of each of its six columns, the paper's "B-spline".
+
+    The spline has the fewest knots, and at most `knots` inside the span, with which its squared residuals sum
+    up to `smoothing`; where that many do not reach it, they are all used.
+    """
+    degree = 3
+    most = min(knots + 2 * (degree + 1), len(t) + degree + 1)  # counting those at the ends
+    values = np.asarray(params, np.float64)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # that the knots do not reach the smoothing
+        columns = [
+            make_splrep(t, column, k=degree, s=smoothing, nest=most)(t)  # pyright: ignore[reportArgumentType]
+            for column in values.T
+        ]
+    return jnp.asarray(np.stack(columns, axis=-1), params.dtype)
+
+
+def describe(config: Config, setup: Setup) -> dict[str, Any]:
+    """The settings of a training, in words and numbers."""
+    train = asdict(setup.train)
+    del train["chunk"]
+    plain = lambda rates: jax.tree.map(
+        lambda rate: [np.unique(part).tolist() for part in rate],
+        rates,
+        is_leaf=lambda x: isinstance(x, Rate),
+    )
+    return {
+        "pose": config.pose,
+        "preset": config.preset,
+        "side": config.side,
+        **train,
+        "net": asdict(config.net) if config.pose == "posenet" else None,
+        "spline_knots": config.spline_knots if "spline" in config.pose else None,
+        "spline_smoothing": config.spline_smoothing if config.pose == "spline_reset" else None,
+        "rates": {"first, last, start": {"scene": plain(setup.scene_rates), "pose": plain(setup.pose_rates)}},
+    }
+
+
+def _field(config: Config, problem: Problem) -> tuple[PoseField, Callable[[Params], Factor], Any]:
+    """The correction of the poses by itself, as a field and as a factor of its file, and its rates."""
+    photographs, paper = problem.train, config.preset == "paper"
+    span = (float(photographs.t[0]), float(photographs.t[-1]))
+    shift_from, turn_from = (0.0, 0.0) if paper else (_SHIFT_FROM, _TURN_FROM)
+    start = "unknown" if config.noise == "unknown" else "noisy"
+    if config.pose == "posenet":
+        # tanh bounds the translation: half the cameras' extent, or, where nothing is known of them, the
+        # nearest depth, which is the unit of LLFF's scenes.
+        scale = photographs.near if config.noise == "unknown" else problem.extent / 2
+        net = replace(config.net, layers=2, width=32) if config.smoke else config.net
+        posenet = PoseNetConfig(span=span, translation_scale=scale, **asdict(net))
+        factor = partial(posenet_factor, posenet)
+        shift, turn = _NET_RATES["paper" if paper else start]
+        rates = {"translation": Rate(*shift, shift_from), "rotation": Rate(*turn, turn_from)}
+        if config.net.coupled:
+            rates = {"coupled": rates["rotation"]}
+        rates = rates if config.net.window is None else rates | {"progress": Rate(1.0, 1.0)}
+        return fields.posenet(posenet), factor, rates
+    if paper:
+        shift = turn = (3e-3 if photographs.spacing == "disparity" else 1e-3, 1e-5)
+    else:
+        shift, turn = _TABLE_RATES[start]
+    if config.pose == "bspline":
+        field, columns = fields.bspline(span, config.spline_knots), (3, 4)
+        factor = partial(bspline_factor, span)
+    else:
+        field, columns = fields.table(photographs.t), (3, 3)
+        factor = partial(table_factor, photographs.t)
+    pairs = zip((*shift, shift_from), (*turn, turn_from), strict=True)
+    return field, factor, Rate(*(np.repeat(pair, columns)[None] for pair in pairs))
+
+
+def _fast_scene(config: Config) -> NerfConfig:
+    return replace(_FAST_SCENE, window=_UNKNOWN_WINDOW) if config.noise == "unknown" else _FAST_SCENE

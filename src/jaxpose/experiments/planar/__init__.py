@@ -1,0 +1,1 @@
+"""Planar alignment: `python -m jaxpose.experiments.planar`."""

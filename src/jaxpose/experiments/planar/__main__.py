@@ -1,0 +1,5 @@
+"""`python -m jaxpose.experiments.planar`."""
+
+from jaxpose.experiments.planar.pipeline import main
+
+main()

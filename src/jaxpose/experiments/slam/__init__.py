@@ -1,0 +1,1 @@
+"""RGB-D(-inertial) SLAM: options, run, evaluation, report."""

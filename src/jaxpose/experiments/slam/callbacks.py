@@ -1,0 +1,60 @@
+"""What a SLAM run leaves in its folder while it goes: a checkpoint and a preview."""
+
+import time
+from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxpose.datasets.types import Recording
+from jaxpose.experiments.slam import map_files
+from jaxpose.files import atomic
+from jaxpose.plots.preview import preview
+from jaxpose.plots.slam import View
+from jaxpose.scenes import GridConfig, grid
+from jaxpose.slam import checkpoint
+from jaxpose.slam.map.world import scene_params
+from jaxpose.slam.pipeline import Progress
+from jaxpose.slam.types import SlamState
+
+SAVE_EVERY_S = 30.0
+_PREVIEW_EVERY_S = 5.0
+_SHARE = 0.02  # of the time that previews may take
+_WIDTH = 80  # [px] of the map in a preview
+
+
+def keeper(folder: Path, recording: Recording, settings: dict[str, Any]) -> Callable[[Progress], None]:
+    """A callback that writes the settings once, and checkpoint and preview every few seconds."""
+    saved = time.perf_counter()
+    next_preview = 0.0
+    viewer = lru_cache(maxsize=1)(lambda size: map_files.viewer(grid(size), size, recording.camera))
+
+    def keep(progress: Progress) -> None:
+        nonlocal saved, next_preview
+        if not (folder / "settings.json").exists() or progress.index == 0:
+            atomic.write_json(folder / "settings.json", settings)
+        if time.perf_counter() - saved > SAVE_EVERY_S:
+            checkpoint.save(folder / "checkpoint.npz", progress.state)
+            saved = time.perf_counter()
+        now, last = time.perf_counter(), progress.index == progress.count - 1
+        if now > next_preview or last:
+            _preview(folder / "preview.png", recording, progress.state, viewer)
+            cost = time.perf_counter() - now
+            next_preview = time.perf_counter() + max(_PREVIEW_EVERY_S, cost / _SHARE)
+
+    return keep
+
+
+def _preview(
+    path: Path, recording: Recording, state: SlamState, viewer: Callable[[GridConfig], map_files.Viewer]
+) -> None:
+    frames, i = state.frames, state.done - 1
+    T_world_cam = frames.T_world_body[: i + 1] @ recording.T_body_cam
+    frame = recording.read(i)
+    pixels = map_files.every(recording.camera, _WIDTH)
+    column, row = np.moveaxis(pixels, -1, 0)
+    rgb, depth = viewer(state.grid)(scene_params(state.map), T_world_cam[i], pixels)
+    view = View(f"t = {recording.t[i]:.1f} s", frame.rgb, rgb, frame.depth[row, column], depth)
+    preview(path, T_world_cam, frames.lost[: i + 1], view)

@@ -1,0 +1,171 @@
+"""What is measured on a tracked recording: cost, errors, the field's own derivatives."""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxpose.datasets.types import Recording
+from jaxpose.errors import DataError
+from jaxpose.evaluation import trajectory_error
+from jaxpose.fields import body_to_camera
+from jaxpose.fields.derivatives import motion
+from jaxpose.fields.intrinsic_motion import THRESHOLD, effective_dof
+from jaxpose.geometry import rigid
+from jaxpose.geometry.camera import angle_of_view
+from jaxpose.imu import Imu, remove_gravity
+from jaxpose.slam.pipeline import SlamResult
+
+_MOST_READINGS = 4000  # compared with the field; more are thinned
+
+
+class Inertial(NamedTuple):
+    """IMU and field at the same times, in body axes: (read, field) of both sensors, and RMS differences."""
+
+    t: Float[np.ndarray, " s"]
+    gyro: tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]]  # rad/s
+    accelerometer: tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]]  # m/s^2, free of gravity
+    gyro_rms: float
+    accelerometer_rms: float
+
+
+class Freedom(NamedTuple):
+    """Degrees of freedom of each motion from frame to frame: the body's own, and in the intrinsic frame."""
+
+    before: Int[np.ndarray, " n"]
+    after: Int[np.ndarray, " n"]
+    numbers: dict[str, Any]
+
+
+class Accuracy(NamedTuple):
+    """Errors against the truth after SE(3) alignment, frame by frame and as numbers for the results."""
+
+    aligned: Float[np.ndarray, "n 4 4"]
+    translation_m: Float[np.ndarray, " n"]
+    rotation_deg: Float[np.ndarray, " n"]
+    numbers: dict[str, Any]
+
+
+class Measured(NamedTuple):
+    """What there was to measure: errors against a truth, an IMU against the field, the intrinsic motion."""
+
+    errors: Accuracy | None
+    inertial: Inertial | None
+    freedom: Freedom | None
+
+    def numbers(self) -> dict[str, Any]:
+        """All of them for the results."""
+        found: dict[str, Any] = {}
+        if self.freedom is not None:
+            found["degrees_of_freedom"] = self.freedom.numbers
+        if self.errors is not None:
+            found |= self.errors.numbers
+        if self.inertial is not None:
+            found["field_gyro_rms_rad_s"] = self.inertial.gyro_rms
+            found["field_accelerometer_rms_m_s2"] = self.inertial.accelerometer_rms
+        return found
+
+
+def cost(result: SlamResult) -> dict[str, Any]:
+    """What tracking cost and how it went."""
+    settled = result.seconds[2:]  # the first two compile
+    return {
+        "frames": len(result.lost),
+        "frames_lost": int(result.lost.sum()),
+        "lost": np.flatnonzero(result.lost),
+        "frames_uncertain": int(result.uncertain.sum()),
+        "uncertain": np.flatnonzero(result.uncertain),
+        "pose_sigma_median": _medians(result.sigma),
+        "seconds_per_frame": float(np.median(settled)),
+        "seconds_per_frame_mean_with_compilation": float(result.seconds.mean()),
+        "iterations_mean": float(result.iterations[1:].mean()),
+        "depth_error_median_m": trajectory_error.statistics(result.depth_error).median,
+        "keyframes": result.keyframes,
+        "field_rmse_m": result.field_rmse_m,
+        "field_rmse_deg": result.field_rmse_deg,
+    }
+
+
+def freedom(recording: Recording, result: SlamResult) -> Freedom | None:
+    """The effective degrees of freedom before and after (paper figure 6); None but for `intrinsic`."""
+    if not np.isfinite(result.T_inner[1:]).all():
+        return None
+    T_world_body = result.T_world_cam @ np.linalg.inv(recording.T_body_cam)
+    view = angle_of_view(recording.camera)
+    motions = (np.linalg.inv(T_world_body[:-1]) @ T_world_body[1:], result.T_inner[1:])
+    before, after = (np.asarray(effective_dof(jnp.asarray(motion, jnp.float32), view)) for motion in motions)
+    numbers = {"threshold": THRESHOLD, "before_mean": float(before.mean()), "after_mean": float(after.mean())}
+    return Freedom(before, after, numbers)
+
+
+def _medians(sigma: Float[np.ndarray, "n 2"]) -> dict[str, float]:
+    """Medians over the frames of which something is known, NaN without any."""
+    known = sigma[np.isfinite(sigma).all(axis=1)]
+    metres, radians = np.median(known, axis=0) if len(known) else (np.nan, np.nan)
+    return {"translation_m": float(metres), "rotation_deg": float(np.rad2deg(radians))}
+
+
+def accuracy(
+    result: SlamResult, t: Float[np.ndarray, " n"], T_world_true: Float[np.ndarray, "n 4 4"]
+) -> Accuracy:
+    """The usual trajectory errors of the tracked poses, and of the final field read at the frames' times."""
+    ate = trajectory_error.ate(result.T_world_cam, T_world_true)
+    aligned = trajectory_error.align(ate.alignment, result.T_world_cam)
+    rotation_deg = rigid.rotation_angle_deg(aligned[:, :3, :3], T_world_true[:, :3, :3])
+    field = jax.jit(jax.vmap(result.field.pose, (None, 0)))
+    field_poses = np.asarray(field(result.field_params, jnp.asarray(t, jnp.float32)), np.float64)
+    numbers = {
+        "alignment": "se3",
+        "ate_rmse_m": ate.rmse,
+        "ate_max_m": ate.max,
+        "rotation_rmse_deg": trajectory_error.statistics(rotation_deg).rmse,
+        "frames_with_truth": ate.frames,
+        "rpe": _drift(result.T_world_cam, T_world_true),
+        "field_ate_rmse_m": trajectory_error.ate(field_poses, T_world_true).rmse,
+    }
+    return Accuracy(aligned, ate.errors, rotation_deg, numbers)
+
+
+def _drift(T_world_cam: Float[np.ndarray, "n 4 4"], T_world_true: Float[np.ndarray, "n 4 4"]):
+    try:
+        rpe = trajectory_error.rpe(T_world_cam, T_world_true)
+    except DataError:  # no two frames in a row have a truth
+        return None
+    return {
+        "delta_frames": 1,
+        "translation_rmse_m": rpe.translation_m.rmse,
+        "rotation_rmse_deg": rpe.rotation_deg.rmse,
+        "pairs": rpe.pairs,
+    }
+
+
+def inertial(recording: Recording, result: SlamResult) -> Inertial | None:
+    """The field's own body rate and acceleration beside what the IMU read; None without an IMU."""
+    imu = recording.imu
+    if imu is None:
+        return None
+    t, read_omega, read_force = (np.asarray(x) for x in imu)
+    inside = np.flatnonzero((t >= recording.t[0]) & (t <= recording.t[-1]))
+    if len(inside) == 0:
+        return None
+    chosen = inside[:: -(-len(inside) // _MOST_READINGS)]
+    t, read_omega, read_force = t[chosen], read_omega[chosen], read_force[chosen]
+    T_cam_body = jnp.asarray(np.linalg.inv(recording.T_body_cam), jnp.float32)
+    gravity_world = jnp.asarray(recording.gravity_world, jnp.float32)
+
+    @jax.jit
+    def derivatives(params, imu):
+        body = body_to_camera(partial(result.field.pose, params), T_cam_body)  # here from camera to body
+        at = jax.vmap(partial(motion, body))(imu.t)
+        R_world_body = at.pose[:, :3, :3]
+        field = jnp.einsum("nji,nj->ni", R_world_body, at.acceleration_world, precision="highest")
+        return at.omega_body, remove_gravity(imu, R_world_body, gravity_world), field
+
+    readings = Imu(*(jnp.asarray(x, jnp.float32) for x in (t, read_omega, read_force)))
+    omega, read, field = (np.asarray(x, np.float64) for x in derivatives(result.field_params, readings))
+    gyro, accelerometer = (read_omega, omega), (read, field)
+    rms = [float(np.sqrt(np.mean((a - b) ** 2))) for a, b in (gyro, accelerometer)]
+    return Inertial(t, gyro, accelerometer, *rms)

@@ -1,0 +1,166 @@
+"""What the SLAM experiments say on the terminal: a bar while they run, then numbers with their protocol."""
+
+import math
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from jaxpose.experiments.command import markdown_table
+from jaxpose.slam.pipeline import ImuMode, Progress
+
+_COLUMNS: tuple[str, ...] = ("IMU", "ATE [cm]", "RPE [cm]", "RPE [deg]", "frames lost", "s / frame")
+
+
+def progress_bar() -> Callable[[ImuMode, Progress], None]:
+    """A callback for `run` that draws a bar on stderr for each tracked recording."""
+    bar: tqdm | None = None
+    lost = 0
+
+    def on_frame(mode: ImuMode, progress: Progress) -> None:
+        nonlocal bar, lost
+        if progress.index == 0:
+            bar = tqdm(total=progress.count, desc=f"IMU {mode}", unit="frame", file=sys.stderr)
+            lost = 0
+        assert bar is not None
+        frames = progress.state.frames
+        lost += bool(frames.lost[progress.index])
+        loss = float(frames.loss[progress.index])
+        state = {"loss": f"{loss:.2f}"} if math.isfinite(loss) else {}  # the first frame has none
+        if math.isfinite(progress.truth_error):
+            state["off"] = f"{100 * progress.truth_error:.1f} cm"
+        bar.set_postfix(state | {"lost": str(lost)}, refresh=False)
+        bar.update()
+        if progress.index == progress.count - 1:
+            bar.close()
+
+    return on_frame
+
+
+def table(by_mode: dict[str, dict[str, Any]]) -> str:
+    """Results of several IMU modes side by side, as the paper's table 13 has them, in Markdown."""
+    rows = [_COLUMNS]
+    for mode, results in by_mode.items():
+        rpe = results.get("rpe")
+        rows.append((
+            mode,
+            _cm(results.get("ate_rmse_m")),
+            _cm(rpe and rpe["translation_rmse_m"]),
+            "-" if rpe is None else f"{rpe['rotation_rmse_deg']:.3f}",
+            f"{results['frames_lost']} of {results['frames']}",
+            f"{results['seconds_per_frame']:.2f}",
+        ))  # fmt: skip
+    return markdown_table(rows)
+
+
+def report(folder: Path, results: dict[str, Any]) -> str:
+    """The numbers of a run, each with its protocol, and where everything is."""
+    if "modes" in results:
+        modes = results["modes"]
+        lines = [_heading(next(iter(modes.values())), "all IMU modes"), "", table(modes), ""]
+        lines += ["  ATE: RMSE over all frames after SE(3) alignment; RPE: RMSE from one frame to the next;"]
+        lines += ["  s / frame: median after the first two, which compile"]
+        lines += [_line("IMU readings", modes["combined"]["imu"]["readings"])]
+        lines += _ending(folder, results, modes["none"]["notes"], "comparison.png")
+        return "\n".join(lines)
+    lines = [_heading(results, f"IMU {results['imu']['mode']}"), ""]
+    if results["imu"]["mode"] != "none":
+        lines.append(_line("IMU readings", results["imu"]["readings"]))
+    if "ate_rmse_m" in results:
+        lines += _against_truth(results)
+    else:
+        lines.append(_line("ATE", "no truth to compare with"))
+    lines += [
+        _line(
+            "lost",
+            f"{results['frames_lost']} of {results['frames']} frames, "
+            f"{results['frames_uncertain']} uncertain",
+        ),
+        _line(
+            "time per frame",
+            f"{results['seconds_per_frame']:.3f} s  median after the first two, which compile; "
+            f"{results['seconds_per_frame_mean_with_compilation']:.3f} s mean of all",
+        ),
+        _line("iterations", f"{results['iterations_mean']:.1f}  mean per frame"),
+        _line(
+            "final field",
+            f"{_cm(results['field_rmse_m'])} cm, {results['field_rmse_deg']:.3f} deg  "
+            "RMSE to the tracked poses",
+        ),
+    ]
+    if "degrees_of_freedom" in results:
+        dof = results["degrees_of_freedom"]
+        lines.append(_line(
+            "effective DOF",
+            f"{dof['before_mean']:.2f}, {dof['after_mean']:.2f} in the intrinsic frame  "
+            f"components of [2 alpha / gamma, v / |v|] above {dof['threshold']:g}, mean of all motions",
+        ))  # fmt: skip
+    lines += _map(results["map"])
+    return "\n".join(lines + _ending(folder, results, results["notes"], "trajectory.png"))
+
+
+def _heading(results: dict[str, Any], imu: str) -> str:
+    data = results["data"]
+    width, height = data["size"]
+    smoke = "  SMOKE RUN, the numbers mean nothing" if results["smoke"] else ""
+    return (
+        f"{results['experiment']}: {data['name']}, {results['frames']} frames of {width}x{height} at "
+        f"{data['rate_hz']:.3g} Hz, {imu}, frame {results['frame_of_reference']}, "
+        f"seed {results['seed']}{smoke}"
+    )
+
+
+def _against_truth(results: dict[str, Any]) -> list[str]:
+    used = f"{results['frames_with_truth']} of {results['frames']} frames"
+    lines = [
+        _line(
+            "ATE-RMSE",
+            f"{_cm(results['ate_rmse_m'])} cm  SE(3) alignment, {used}; "
+            f"at most {_cm(results['ate_max_m'])} cm",
+        ),
+        _line("rotation RMSE", f"{results['rotation_rmse_deg']:.3f} deg  after the same alignment"),
+        _line(
+            "ATE of the field", f"{_cm(results['field_ate_rmse_m'])} cm  the final field at the frames' times"
+        ),
+    ]
+    rpe = results["rpe"]
+    if rpe is not None:
+        lines.insert(2, _line(
+            "RPE-RMSE",
+            f"{_cm(rpe['translation_rmse_m'])} cm, {rpe['rotation_rmse_deg']:.3f} deg  "
+            "from one frame to the next",
+        ))  # fmt: skip
+    return lines
+
+
+def _map(quality: dict[str, Any]) -> list[str]:
+    """The map at frames it was made from, and at those held out."""
+    words = []
+    for kind, name in (("mapped", "mapped frames"), ("held_out", "held-out frames")):
+        numbers = quality[kind]
+        if numbers is not None:
+            depth, share = _cm(numbers["depth_l1_m"]), f"{numbers['share_of_depth_shown']:.1%}"
+            words.append(
+                f"{numbers['psnr']:.2f} dB, depth L1 {depth} cm over {share} of the depth at "
+                f"{numbers['frames']} {name}"
+            )
+    if not words:
+        return []
+    return [_line("map", "; ".join(words)), _line("", quality["protocol"])]
+
+
+def _ending(folder: Path, results: dict[str, Any], notes: tuple[str, ...], picture: str) -> list[str]:
+    cost = f"{results['wall_s']:.0f} s in all, {results['peak_rss_bytes'] / 2**30:.2f} GiB of memory at most"
+    lines = [_line("cost", cost), *(_line("note", note) for note in notes)]
+    pictures = sorted(str(path.relative_to(folder)) for path in folder.glob("*.png"))
+    return [*lines, _line("pictures", ", ".join(pictures) or picture), _line("written to", str(folder))]
+
+
+def _line(name: str, text: str) -> str:
+    return f"  {name:<17} {text}"
+
+
+def _cm(metres: float | None) -> str:
+    return "-" if metres is None else f"{100 * metres:.2f}"

@@ -1,0 +1,249 @@
+"""What trainings on photographs and on events share: the loop, its progress, checkpoints, the run folder."""
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar, runtime_checkable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxpose.errors import DataError
+from jaxpose.evaluation import trajectory_error
+from jaxpose.experiments import command
+from jaxpose.fields import PoseField, set_progress
+from jaxpose.files import atomic, run_folder
+from jaxpose.files import checkpoint as checkpoint_file
+from jaxpose.nn import Activation
+from jaxpose.training.steps import State, Trainer
+
+CHUNK = 100  # steps in one compiled call
+COLUMNS = ("step", "loss", "rotation_deg", "translation", "seconds")
+_SAVE_EVERY_S = 30.0
+
+
+@dataclass(frozen=True)
+class NetConfig:
+    """PoseNet's variants of tables 3 and 12; the defaults are the paper's main network."""
+
+    octaves: int = 5  # of the time encoding; 0: time alone
+    layers: int = 8
+    width: int = 256
+    coupled: bool = False  # one network with 7 outputs
+    activation: Activation = "relu"
+    window: tuple[float, float] | None = None  # coarse-to-fine on the time encoding, shares of the training
+
+
+class Progress(NamedTuple):
+    """Where a training is: after `step` of `steps`."""
+
+    label: str
+    steps: int
+    extent: float  # of the cameras' way [scene units]
+    step: int
+    loss: float
+    rotation_deg: float
+    translation: float  # [scene units]
+
+
+OnProgress = Callable[[Progress], None]
+
+
+class Outcome(NamedTuple):
+    """Where a run was written, and its results; those of a study under `runs`, by label."""
+
+    folder: Path
+    results: dict[str, Any]
+
+
+class Trained(NamedTuple):
+    """Where a training stands, and how it went there: rows of `COLUMNS`, NaN where it has not been."""
+
+    state: State
+    history: Float[np.ndarray, "c 5"]
+
+
+@runtime_checkable
+class _Train(Protocol):
+    @property
+    def steps(self) -> int: ...
+
+
+@runtime_checkable
+class Setup(Protocol):
+    """What both experiments' setups have beside their own."""
+
+    @property
+    def trainer(self) -> Trainer: ...
+
+    @property
+    def train(self) -> _Train: ...
+
+
+def fresh(setup: Setup, seed: int) -> Trained:
+    """A training at its start."""
+    history = np.full((setup.train.steps // CHUNK, len(COLUMNS)), np.nan)
+    return Trained(setup.trainer.start(jax.random.key(seed)), history)
+
+
+def train(
+    setup: Setup,
+    trained: Trained,
+    data: Any,
+    errors: Callable[[Any], tuple[float, float]],
+    checkpoint: Path,
+    on_progress: OnProgress | None,
+    *,
+    label: str,
+    extent: float,
+    between: Callable[[State], State] = lambda state: state,
+) -> Trained:
+    """Train to the end, from the checkpoint if there is one, and keep one as it goes.
+
+    `errors` gives rotation [deg] and translation errors of the pose field's parameters, `between` changes the
+    state after every chunk; `label` and `extent` are for the progress. DataError where the loss is no longer
+    a number.
+    """
+    if checkpoint.exists():
+        trained = checkpoint_file.load(checkpoint, trained)
+    state, history = trained.state, trained.history.copy()
+    done = int(state.step) // CHUNK
+    before = history[done - 1, -1] if done else 0.0
+    started = saved = time.perf_counter()
+    for chunk in range(done, len(history)):
+        state, losses = setup.trainer.advance(state, data, CHUNK)
+        state = between(state)
+        step, loss = (chunk + 1) * CHUNK, float(losses.mean())
+        if not np.isfinite(loss):
+            raise DataError(f"step {step}: expected a finite loss, got {loss}")
+        found = errors(state.pose)
+        now = time.perf_counter()
+        history[chunk] = (step, loss, *found, before + now - started)
+        if now - saved > _SAVE_EVERY_S or chunk + 1 == len(history):
+            checkpoint_file.save(checkpoint, Trained(state, history))
+            saved = now
+        if on_progress is not None:
+            on_progress(Progress(label, setup.train.steps, extent, step, loss, *found))
+    return Trained(state, history)
+
+
+def prepare(folder: Path, config: Any, settings: dict[str, Any], *, resume: bool) -> None:
+    """Leave in the folder the config, and earlier results only if they are this run's and to be kept."""
+    stored = folder / "settings.json"
+    settings = json.loads(json.dumps(settings, default=_plain))
+    if not command.resumes(folder, stored, settings, resume):
+        for name in ("checkpoint.npz", "results.json"):
+            (folder / name).unlink(missing_ok=True)
+        atomic.write_json(stored, settings)
+    atomic.write_json(folder / "config.json", config)
+
+
+def pose_reader(field: PoseField, t: Float[np.ndarray, " n"]) -> Callable[[Any], Float[np.ndarray, "n 4 4"]]:
+    """Poses at some times, from the parameters of the field."""
+    times = jnp.asarray(t, jnp.float32)
+    compiled = jax.jit(lambda params: jax.vmap(field.pose, (None, 0))(params, times))
+    return lambda params: np.asarray(compiled(params), np.float64)
+
+
+def mean_errors(
+    estimate: Float[np.ndarray, "n 4 4"], truth: Float[np.ndarray, "n 4 4"]
+) -> tuple[float, float]:
+    """Mean rotation [deg] and translation error after alignment, as `metrics.pose_errors`."""
+    found = trajectory_error.pose_errors(estimate, truth)
+    return found.rotation_deg, found.translation
+
+
+def progress_bar(describe: Callable[[Progress], dict[str, str]]) -> OnProgress:
+    """A callback that draws a bar on stderr for each training, with what `describe` says of it."""
+    bar = command.step_bar()
+    return lambda progress: bar(
+        progress.label or "training", progress.step, progress.steps, describe(progress)
+    )
+
+
+def results_of(
+    experiment: str, config: Any, trained: Trained, started: float, **found: Any
+) -> dict[str, Any]:
+    """What `results.json` of a run holds: what was `found`, and how it was trained and measured."""
+    steps, *_, seconds = trained.history[-1]
+    return {
+        "experiment": experiment,
+        "seed": config.seed,
+        "smoke": config.smoke,
+        **found,
+        "train_s": seconds,
+        "seconds_per_step": seconds / steps,
+        "history_columns": COLUMNS,
+        "history": trained.history,
+        **_cost(started),
+    }
+
+
+def write_study(
+    folder: Path, experiment: str, config: Any, runs: dict[str, dict[str, Any]], table: str, started: float
+) -> Outcome:
+    """Leave in the folder what runs side by side have found."""
+    whole = {
+        "experiment": experiment,
+        "study": config.study,
+        "seed": config.seed,
+        "smoke": config.smoke,
+        "runs": runs,
+        **_cost(started),
+    }
+    atomic.write_json(folder / "config.json", config)
+    atomic.write_text(folder / "table.md", table + "\n")
+    atomic.write_json(folder / "results.json", whole)
+    return Outcome(folder, whole)
+
+
+P = TypeVar("P")
+S = TypeVar("S", bound=Setup)
+
+
+@dataclass(frozen=True)
+class Loaded(Generic[P, S]):
+    """A finished run: `setup.field.pose(state.pose, t)` is the camera's pose at any time [s], and
+    `setup.scene.query(state.scene, point, direction)` the density and colour of the scene."""
+
+    problem: P
+    setup: S
+    state: State
+
+
+def load_run(
+    folder: Path | str,
+    config_type: Callable[..., Any],
+    load: Callable[[Any], P],
+    build: Callable[[Any, P], S],
+) -> Loaded[P, S]:
+    """The scene and the trajectory that a run has left in its folder; its data are read again.
+
+    DataError or OSError for a folder that holds no run.
+    """
+    settings = json.loads((Path(folder) / "settings.json").read_text())
+    net, window = settings["net"], settings["net"]["window"]
+    net = NetConfig(**net | {"window": window and tuple(window)})
+    config = config_type(**settings | {"data": Path(settings["data"]), "net": net})
+    problem = load(config)
+    setup = build(config, problem)
+    state = checkpoint_file.load(Path(folder) / "checkpoint.npz", fresh(setup, config.seed)).state
+    scene = set_progress(state.scene, jnp.ones(()))
+    return Loaded(problem, setup, state._replace(scene=scene))
+
+
+def _cost(started: float) -> dict[str, Any]:
+    return {
+        "versions": run_folder.versions(),
+        "wall_s": time.perf_counter() - started,
+        "peak_rss_bytes": run_folder.peak_rss_bytes(),
+    }
+
+
+def _plain(value: Any) -> Any:
+    """A path as text, a nested config as a dict."""
+    return str(value) if isinstance(value, Path) else vars(value)

@@ -1,0 +1,61 @@
+"""Checkpoints: a pytree of arrays in one file, written whole or not at all."""
+
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxpose.errors import DataError
+from jaxpose.files.atomic import atomic
+
+
+def save(path: Path | str, tree: Any) -> None:
+    """Write the arrays and random keys of a pytree (npz, by their place in it)."""
+    arrays = {jax.tree_util.keystr(at): np.asarray(_data(leaf)) for at, leaf in _leaves(tree)}
+    with atomic(path) as temporary:
+        np.savez(temporary, allow_pickle=False, **arrays)
+
+
+def load(path: Path | str, like: Any) -> Any:
+    """Read what `save` wrote, into a tree of the shape of `like`, bit by bit as it was.
+
+    DataError naming the file if it is damaged or holds other arrays.
+    """
+    expected = _leaves(like)
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = dict(file)
+    except (zipfile.BadZipFile, ValueError, EOFError) as error:
+        raise DataError(f"{path}: expected a checkpoint, got {' '.join(str(error).split())}") from None
+    leaves = []
+    for at, leaf in expected:
+        name, data = jax.tree_util.keystr(at), _data(leaf)
+        found = arrays.pop(name, None)
+        if found is None or (found.shape, found.dtype) != (data.shape, data.dtype):
+            got = "nothing" if found is None else f"{found.dtype} of shape {found.shape}"
+            raise DataError(f"{path}: expected {name}, {data.dtype} of shape {data.shape}, got {got}")
+        leaves.append(_like(leaf, found))
+    if arrays:
+        raise DataError(f"{path}: expected nothing more, got {', '.join(sorted(arrays)[:3])}")
+    return jax.tree.unflatten(jax.tree.structure(like), leaves)
+
+
+def _leaves(tree: Any) -> list[tuple[Any, Any]]:
+    return jax.tree_util.tree_flatten_with_path(tree)[0]
+
+
+def _is_key(leaf: Any) -> bool:
+    return isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def _data(leaf: Any) -> Any:
+    return jax.random.key_data(leaf) if _is_key(leaf) else leaf
+
+
+def _like(leaf: Any, found: np.ndarray) -> Any:
+    if _is_key(leaf):
+        return jax.random.wrap_key_data(jnp.asarray(found), impl=jax.random.key_impl(leaf))
+    return jnp.asarray(found) if isinstance(leaf, jax.Array) else found

@@ -1,0 +1,117 @@
+"""PLY files (Stanford's polygon format): point clouds and meshes."""
+
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from jaxpose.errors import DataError
+from jaxpose.files.atomic import atomic
+
+_TYPES = {
+    **{"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1"},
+    **{"short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2"},
+    **{"int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4"},
+    **{"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"},
+}
+_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
+
+
+def read_points(path: Path | str) -> Float[np.ndarray, "n 3"]:
+    """The x, y, z of the vertices of a PLY file, ascii or binary, float64; all else in it is passed over.
+
+    Vertices must come before other elements and have no lists, as scanners and mesh tools write them.
+    DataError naming the file (and the line of a header or text) for what cannot be read; OSError as usual.
+    """
+    path = Path(path)
+    with path.open("rb") as stream:
+        form, count, properties, lines = _header(path, stream)
+        names = [name for name, _ in properties]
+        missing = [axis for axis in "xyz" if axis not in names]
+        if missing or count == 0:
+            got = f"no {' '.join(missing)}" if missing else "none"
+            raise DataError(f"{path}: expected vertices with x y z, got {got}")
+        if form == "ascii":
+            return _text(path, stream, count, [names.index(axis) for axis in "xyz"], lines)
+        kind = np.dtype([(name, _ORDERS[form] + code) for name, code in properties])
+        vertices = np.fromfile(stream, kind, count)
+    if len(vertices) != count:
+        raise DataError(f"{path}: expected {count} vertices, got {len(vertices)}")
+    return np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
+
+
+def write_ply(
+    path: Path | str,
+    points: Float[np.ndarray, "n 3"],
+    rgb: UInt8[np.ndarray, "n 3"],
+    faces: Int[np.ndarray, "m 3"] | None = None,
+) -> None:
+    """Write coloured points [m], or triangles between them too, as binary PLY in float32; atomically."""
+    vertex = np.dtype([(axis, "<f4") for axis in "xyz"] + [(c, "u1") for c in ("red", "green", "blue")])
+    vertices = np.empty(len(points), vertex)
+    for k, axis in enumerate("xyz"):
+        vertices[axis] = points[:, k]
+    for k, channel in enumerate(("red", "green", "blue")):
+        vertices[channel] = rgb[:, k]
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
+    header += [f"property float {axis}" for axis in "xyz"]
+    header += [f"property uchar {channel}" for channel in ("red", "green", "blue")]
+    triangles = np.empty(0 if faces is None else len(faces), [("count", "u1"), ("corners", "<i4", 3)])
+    if faces is not None:
+        header += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
+        triangles["count"], triangles["corners"] = 3, faces
+    with atomic(path) as temporary, temporary.open("wb") as stream:
+        stream.write(("\n".join([*header, "end_header"]) + "\n").encode())
+        stream.write(vertices.tobytes())
+        stream.write(triangles.tobytes())
+
+
+def _header(path: Path, stream: BinaryIO) -> tuple[str, int, list[tuple[str, str]], int]:
+    """Encoding, number of vertices, their properties as numpy types, and the lines of the header."""
+    form, count, element, number = "", 0, "", 0
+    properties: list[tuple[str, str]] = []
+    elements: list[str] = []
+    for number, line in enumerate(iter(lambda: stream.readline(1000), b""), start=1):
+        words = line.decode("ascii", "replace").split() or [""]
+        match words:
+            case ["ply"] if number == 1:
+                continue
+            case _ if number == 1:
+                raise DataError(f"{path}:1: expected a PLY file, which begins with ply, got {line[:20]!r}")
+            case ["end_header"]:
+                break
+            case ["format", encoding, _] if encoding == "ascii" or encoding in _ORDERS:
+                form = encoding
+            case ["element", name, size] if size.isdecimal():
+                element = name
+                elements.append(name)
+                count = int(size) if name == "vertex" else count
+            case ["property", kind, name] if element == "vertex" and kind in _TYPES:
+                properties.append((name, _TYPES[kind]))
+            case ["property", *_] if element not in ("vertex", ""):
+                continue
+            case ["comment" | "obj_info", *_]:
+                continue
+            case _:
+                raise DataError(f"{path}:{number}: expected a line of a PLY header, got {line[:60]!r}")
+    else:
+        raise DataError(f"{path}: expected a PLY header with end_header, got {number} lines without")
+    if not form or elements[:1] != ["vertex"]:
+        got = "no format" if not form else f"{elements[0] if elements else 'none'} first"
+        raise DataError(f"{path}: expected a PLY header with format and vertices first, got {got}")
+    return form, count, properties, number
+
+
+def _text(
+    path: Path, stream: BinaryIO, count: int, columns: list[int], above: int
+) -> Float[np.ndarray, "n 3"]:
+    try:
+        points = np.loadtxt(stream, np.float64, usecols=columns, max_rows=count, ndmin=2, comments=None)
+    except ValueError as error:
+        raise DataError(
+            f"{path}: expected {count} lines of numbers below line {above}, got {error}"
+        ) from None
+    if len(points) != count:
+        raise DataError(f"{path}: expected {count} vertices, got {len(points)}")
+    return points

@@ -1,0 +1,48 @@
+"""The folder of a run, and what it states about machine and versions."""
+
+import platform
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+
+import jaxpose
+
+
+def run_folder(experiment: str, *, name: str | None = None, out: Path | str | None = None) -> Path:
+    """Make and return the folder of a run: `out` if given, else `outputs/<experiment>/<name or time stamp>`.
+
+    A folder that was named may exist already, to be written over or resumed.
+    """
+    stamp = f"{datetime.now():%Y-%m-%d_%H-%M-%S.%f}"
+    folder = Path(out) if out is not None else Path("outputs") / experiment / (name or stamp)
+    folder.mkdir(parents=True, exist_ok=out is not None or name is not None)
+    return folder
+
+
+def peak_rss_bytes() -> int:
+    """The most memory this process has held."""
+    status = Path("/proc/self/status")
+    for line in status.read_text().splitlines() if status.exists() else ():
+        if line.startswith("VmHWM:"):
+            return int(line.split()[1]) * 1024
+    import resource  # not on Windows
+
+    # Also counts the parent up to the fork, hence the second choice; macOS gives bytes, others kilobytes.
+    unit = 1 if platform.system() == "Darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
+
+
+def versions() -> dict[str, str]:
+    """What a result depends on besides its configuration: software and device."""
+    import jax  # slow to load, and files of trajectories are read without it
+
+    return {
+        "python": platform.python_version(),
+        "jaxpose": jaxpose.__version__,
+        "jax": jax.__version__,
+        "numpy": np.__version__,
+        "platform": platform.platform(),
+        "backend": jax.default_backend(),
+        "device": jax.devices()[0].device_kind,
+    }

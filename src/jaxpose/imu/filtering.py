@@ -1,0 +1,213 @@
+"""Motion from gyroscope, accelerometer and poses of the same body: denoised, free of bias and of gravity.
+
+The numpy side of `ekf`: what is checked, which pose belongs to which reading, and the result per reading.
+
+Tested on EuRoC, whose truth is a smoothed fusion and no measurement: white noise of a stated size is added to
+its poses, and the IMU's densities are fitted by likelihood on half of one recording (experiments/README.md).
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
+
+from jaxpose.errors import DataError
+from jaxpose.imu import eskf
+from jaxpose.imu.eskf import PoseNoise
+from jaxpose.imu.types import GRAVITY_WORLD, Gravity, Imu, ImuNoise
+
+
+class Prior(NamedTuple):
+    """One standard deviation, per axis, of what the first pose does not tell; the biases' mean is zero."""
+
+    velocity: float = 1.0  # m/s, about the difference of the first poses
+    gyro_bias: float = 0.1  # rad/s
+    accelerometer_bias: float = 0.5  # m/s^2
+
+
+DEFAULT_PRIOR = Prior()
+_MOST_PERIODS = 10  # the trapezoidal rule knows nothing of what happens in between
+
+
+class Filtered(NamedTuple):
+    """The body's motion at every IMU stamp, SI units; rows before the first pose are NaN.
+
+    Readings are free of bias, the acceleration of gravity too. Innovations are [translation (world), rotation
+    (body)] of the measured pose against the predicted one, NaN where there was no pose.
+    """
+
+    t: Float[np.ndarray, " n"]
+    T_world_body: Float[np.ndarray, "n 4 4"]
+    velocity_world: Float[np.ndarray, "n 3"]
+    omega_body: Float[np.ndarray, "n 3"]
+    acceleration_body: Float[np.ndarray, "n 3"]
+    acceleration_world: Float[np.ndarray, "n 3"]
+    gyro_bias: Float[np.ndarray, "n 3"]
+    accelerometer_bias: Float[np.ndarray, "n 3"]
+    covariance: Float[np.ndarray, "n 15 15"]  # of the error
+    innovation: Float[np.ndarray, "n 6"]
+    innovation_covariance: Float[np.ndarray, "n 6 6"]
+    nis: Float[np.ndarray, " n"]  # normalised innovation squared, chi-square of 6 dof if all is as stated
+    log_likelihood: float  # of the poses after the first
+    poses_used: int
+    poses_skipped: int  # not finite, beyond the readings, or not the nearest to any stamp
+
+
+def filter_imu(
+    imu: Imu,
+    t_pose: Float[np.ndarray, " m"],
+    T_world_body: Float[np.ndarray, "m 4 4"],
+    noise: ImuNoise,
+    pose_noise: PoseNoise,
+    *,
+    prior: Prior = DEFAULT_PRIOR,
+    smooth: bool = False,
+    gravity_world: Gravity = GRAVITY_WORLD,
+) -> Filtered:
+    """Fuse readings with poses of the same body (m, on the same clock), in JAX's default precision.
+
+    A pose corrects the state at the reading nearest to it, which is carried to the pose's own time by its own
+    velocity and rate: nothing is interpolated. `smooth` lets later poses speak for earlier states too; the
+    innovations stay those of the forward pass, and the acceleration is then the slope of the velocity. Poses
+    with NaN are left out and counted. DataError for stamps that do not rise, readings that are not finite or
+    more than ten periods apart, or fewer than two poses within the readings; ValueError for sigmas.
+
+    A data sheet knows nothing of vibration or of the timing of poses, so on a real machine its densities are
+    too small by far. State those that hold there, for example the ones of the highest `log_likelihood`.
+    """
+    if not all(np.isfinite(noise)) or min(noise) < 0 or min(pose_noise) <= 0 or min(prior) <= 0:
+        raise ValueError(
+            f"expected noise of at least 0 and sigmas above 0, got {noise}, {pose_noise}, {prior}"
+        )
+    t = _readings_checked(imu)
+    late, row = _nearest_poses(t, np.asarray(t_pose, np.float64), np.asarray(T_world_body, np.float64))
+    used = np.flatnonzero(row >= 0)
+    if len(used) < 2:
+        raise DataError(
+            f"poses: expected at least 2 finite ones within the readings ({t[0]:.3f} to {t[-1]:.3f} s),"
+            f" got {len(used)} of {len(t_pose)}"
+        )
+    first = used[0]
+    pairs = lambda values: np.stack([values[first:-1], values[first + 1 :]], axis=1)
+    measured, T_measured = row[first + 1 :] >= 0, np.array(T_world_body, np.float64)[row[first + 1 :]]
+    # The row of a step without a pose must be finite: what is masked out would still turn gradients into NaN.
+    T_measured[~measured] = np.eye(4)
+    steps = eskf.Step(
+        dt=jnp.asarray(np.diff(t[first:])),
+        omega_body=jnp.asarray(pairs(np.asarray(imu.omega_body))),
+        acceleration_body=jnp.asarray(pairs(np.asarray(imu.acceleration_body))),
+        T_world_body=jnp.asarray(T_measured),
+        late=jnp.asarray(late[first + 1 :]),
+        measured=jnp.asarray(measured),
+    )
+    start = _start(t, imu, late, row, used, t_pose, T_world_body)
+    sigmas = [
+        pose_noise.position,
+        prior.velocity,
+        pose_noise.rotation,
+        prior.gyro_bias,
+        prior.accelerometer_bias,
+    ]
+    covariance = np.diag(np.repeat(sigmas, 3).astype(np.float64) ** 2)
+    covariance = jnp.asarray(covariance)
+    gravity = jnp.asarray(gravity_world, covariance.dtype)
+    settings = jax.tree.map(lambda x: jnp.asarray(x, covariance.dtype), (noise, pose_noise))
+    passed = eskf.forward(start, covariance, steps, *settings, gravity)
+    if smooth:
+        states = eskf.backward(start, covariance, passed)
+    else:
+        begin = lambda a, rest: jnp.concatenate([a[None], rest])
+        states = jax.tree.map(begin, (start, covariance), (passed.state, passed.covariance))
+    return _output(imu, t, first, states, passed, measured, len(used), len(t_pose), gravity_world, smooth)
+
+
+def _readings_checked(imu: Imu) -> Float[np.ndarray, " n"]:
+    """The stamps of readings that can be used."""
+    t = np.asarray(imu.t, np.float64)
+    _check_rising("IMU", t)
+    finite = np.isfinite(np.concatenate([imu.omega_body, imu.acceleration_body], axis=1)).all(axis=1)
+    if len(t) < 2 or not finite.all():
+        found = f"{len(t)}" if len(t) < 2 else f"NaN or infinity in row {int(np.argmin(finite))}"
+        raise DataError(f"IMU: expected at least 2 finite readings, got {found}")
+    step, most = np.diff(t), _MOST_PERIODS * np.median(np.diff(t))
+    if step.max() > most:
+        row = int(step.argmax())
+        raise DataError(
+            f"IMU: expected readings at most {most:.3g} s apart ({_MOST_PERIODS} periods),"
+            f" got {step[row]:.3g} s after {t[row]:.3f} s: filter the parts one by one"
+        )
+    return t
+
+
+def _check_rising(name: str, t: Float[np.ndarray, " n"]) -> None:
+    rise = np.diff(t) > 0
+    if not rise.all():
+        row = int(np.argmin(rise)) + 1
+        raise DataError(f"{name}: expected rising stamps, got {t[row]} after {t[row - 1]} s")
+
+
+def _nearest_poses(
+    t: Float[np.ndarray, " n"], t_pose: Float[np.ndarray, " m"], poses: Float[np.ndarray, "m 4 4"]
+) -> tuple[Float[np.ndarray, " n"], Int[np.ndarray, " n"]]:
+    """For each reading how late its pose comes [s], and the pose's row, -1 where there is none."""
+    _check_rising("poses", t_pose)
+    near = np.searchsorted((t[1:] + t[:-1]) / 2, t_pose)
+    late = t_pose - t[near]
+    usable = np.isfinite(poses).all(axis=(1, 2)) & (np.abs(late) <= np.median(np.diff(t)))
+    nearest_last = np.argsort(-np.abs(late))  # of several at one reading, the last written stays
+    order = nearest_last[usable[nearest_last]]
+    row, wait = np.full(len(t), -1), np.zeros(len(t))
+    row[near[order]], wait[near[order]] = order, late[order]
+    return wait, row
+
+
+def _start(t, imu: Imu, late, row, used, t_pose, poses) -> eskf.State:
+    """The first pose, with the mean velocity to the pose a tenth of a second on, carried to the reading."""
+    first = used[0]
+    ahead = used[min(max(1, np.searchsorted(t[used], t[first] + 0.1)), len(used) - 1)]
+    a, b = row[first], row[ahead]
+    velocity = (poses[b, :3, 3] - poses[a, :3, 3]) / (t_pose[b] - t_pose[a])
+    T = np.array(poses[a], np.float64)
+    T[:3, 3] -= velocity * late[first]
+    T[:3, :3] = T[:3, :3] @ Rotation.from_rotvec(-np.asarray(imu.omega_body)[first] * late[first]).as_matrix()
+    return eskf.State(*map(jnp.asarray, (T, velocity, np.zeros(3), np.zeros(3))))
+
+
+def _output(imu, t, first, states, passed, measured, used, given, gravity_world, smooth) -> Filtered:
+    """Everything as numpy, one row per reading."""
+    (state, covariance), passed, measured = jax.tree.map(np.asarray, (states, passed, measured))
+
+    def rows(values, valid=None):
+        full = np.full((len(t), *values.shape[1:]), np.nan, values.dtype)
+        full[len(t) - len(values) :] = values
+        if valid is not None:
+            full[len(t) - len(values) :][~valid] = np.nan
+        return full
+
+    R = state.T_world_body[:, :3, :3]
+    force = np.asarray(imu.acceleration_body)[first:] - state.accelerometer_bias
+    acceleration = np.einsum("nij,nj->ni", R, force) + np.asarray(gravity_world)
+    if smooth:  # what the poses say of the noise of the readings is in the velocity already
+        acceleration = np.gradient(state.velocity_world, t[first:], axis=0)
+    S, nis = passed.innovation_covariance[measured], passed.nis[measured]
+    log_likelihood = -(nis + np.linalg.slogdet(2 * np.pi * S)[1]).sum() / 2
+    return Filtered(
+        t=t,
+        T_world_body=rows(state.T_world_body),
+        velocity_world=rows(state.velocity_world),
+        omega_body=rows(np.asarray(imu.omega_body)[first:] - state.gyro_bias),
+        acceleration_body=rows(np.einsum("nji,nj->ni", R, acceleration)),
+        acceleration_world=rows(acceleration),
+        gyro_bias=rows(state.gyro_bias),
+        accelerometer_bias=rows(state.accelerometer_bias),
+        covariance=rows(covariance),
+        innovation=rows(passed.innovation, measured),
+        innovation_covariance=rows(passed.innovation_covariance, measured),
+        nis=rows(passed.nis, measured),
+        log_likelihood=float(log_likelihood),
+        poses_used=used,
+        poses_skipped=given - used,
+    )

@@ -1,0 +1,153 @@
+"""What an IMU, ideal or noisy, reads along a pose function or along splines through stamped poses."""
+
+from collections.abc import Callable
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, RotationSpline, Slerp
+
+from jaxpose.errors import DataError
+from jaxpose.fields.derivatives import PoseFn, motion
+from jaxpose.imu.types import GRAVITY_WORLD, QUIET, Gravity, Imu, ImuNoise
+
+
+def simulate(
+    pose_fn: PoseFn,
+    times: Float[Array, " n"],
+    *,
+    noise: ImuNoise = QUIET,
+    key: PRNGKeyArray | None = None,
+    gravity_world: Gravity = GRAVITY_WORLD,
+) -> Imu:
+    """Readings at `times` of an IMU whose pose is `pose_fn` (`t -> T_world_body`); jax arrays.
+
+    For an IMU on a camera pass `lambda t: se3.compose(camera_pose(t), T_cam_body)`. `key` makes the `noise`.
+    """
+    at = jax.vmap(lambda t: motion(pose_fn, t))(times)
+    gravity = jnp.asarray(gravity_world, at.pose.dtype)
+    force = _to_body(at.pose[:, :3, :3], at.acceleration_world - gravity[None])
+    return add_noise(Imu(times, at.omega_body, force), noise, key)
+
+
+def simulate_from_poses(
+    times: Float[np.ndarray, " n"],
+    poses: Float[np.ndarray, "n 4 4"],
+    rate_hz: float,
+    *,
+    rotation: Literal["slerp", "spline"] = "slerp",
+    T_cam_body: Float[np.ndarray, "4 4"] | None = None,
+    noise: ImuNoise = QUIET,
+    key: PRNGKeyArray | None = None,
+    gravity_world: Gravity = GRAVITY_WORLD,
+) -> Imu:
+    """Readings at `rate_hz` from the first to the last of stamped poses; numpy float64.
+
+    `poses` are `T_world_body`, or `T_world_cam` with the extrinsics `T_cam_body` of an IMU mounted elsewhere.
+    `rotation` as in `interpolant`; "slerp" is METHOD's. `key` is for `noise`.
+    """
+    if T_cam_body is not None:
+        # Before the splines: the body's own path is then smooth even where slerp makes it turn at once.
+        poses = poses @ T_cam_body
+    path = interpolant(times, poses, rotation)
+    count = int(np.floor((path.last - path.first) * rate_hz + 1e-9)) + 1
+    t = np.minimum(path.first + np.arange(count) / rate_hz, path.last)
+    force = _to_body(path.pose(t)[:, :3, :3], path.acceleration_world(t) - np.asarray(gravity_world))
+    return add_noise(Imu(t, path.omega_body(t), force), noise, key)
+
+
+class Interpolant(NamedTuple):
+    """A path through stamped poses: functions of times (n,) between `first` and `last` [s], float64."""
+
+    first: float
+    last: float
+    pose: Callable[[Float[np.ndarray, " n"]], Float[np.ndarray, "n 4 4"]]
+    velocity_world: Callable[[Float[np.ndarray, " n"]], Float[np.ndarray, "n 3"]]
+    acceleration_world: Callable[[Float[np.ndarray, " n"]], Float[np.ndarray, "n 3"]]
+    omega_body: Callable[[Float[np.ndarray, " n"]], Float[np.ndarray, "n 3"]]
+
+
+def interpolant(
+    times: Float[np.ndarray, " n"],
+    poses: Float[np.ndarray, "n 4 4"],
+    rotation: Literal["slerp", "spline"] = "slerp",
+) -> Interpolant:
+    """Cubic splines through the positions; for the rotations slerp or a twice differentiable spline.
+
+    Slerp is METHOD's (section 5); its body rate is constant between two stamps and jumps at each. Derivatives
+    are the splines' own. Rows that are not finite (no truth) are left out and bridged. DataError if fewer
+    than two are left or the times do not rise.
+    """
+    usable = np.isfinite(poses).all(axis=(1, 2))
+    times, poses = np.asarray(times, np.float64)[usable], np.asarray(poses, np.float64)[usable]
+    if len(times) < 2:
+        raise DataError(f"poses to interpolate: expected at least 2 finite ones, got {len(times)}")
+    if not (np.diff(times) > 0).all():
+        row = int(np.argmin(np.diff(times))) + 1
+        raise DataError(
+            f"poses to interpolate: expected rising times, got {times[row]} after {times[row - 1]}"
+        )
+    position = CubicSpline(times, poses[:, :3, 3])
+    orientation, omega_body = _rotation_path(times, Rotation.from_matrix(poses[:, :3, :3]), rotation)
+
+    def pose(t):
+        T_world_body = np.tile(np.eye(4), (len(t), 1, 1))
+        T_world_body[:, :3, :3] = orientation(t).as_matrix()
+        T_world_body[:, :3, 3] = position(t)
+        return T_world_body
+
+    return Interpolant(
+        first=float(times[0]),
+        last=float(times[-1]),
+        pose=pose,
+        velocity_world=lambda t: position(t, 1),
+        acceleration_world=lambda t: position(t, 2),
+        omega_body=omega_body,
+    )
+
+
+def add_noise(imu: Imu, noise: ImuNoise, key: PRNGKeyArray | None) -> Imu:
+    """Readings with white noise (density / sqrt(dt)) and biases that walk from zero; numpy stays numpy.
+
+    The draws are float32 in every case, so a key means the same noise in both precisions. ValueError for
+    noise without a key or without two readings, whose spacing is dt.
+    """
+    if noise == QUIET:
+        return imu
+    if key is None or len(imu.t) < 2:
+        raise ValueError(f"expected a key and at least 2 readings for {noise}, got {key} and {len(imu.t)}")
+    gyro_key, accelerometer_key = jax.random.split(key)
+    return Imu(
+        imu.t,
+        imu.omega_body + _noise(gyro_key, imu, noise.gyro_density, noise.gyro_walk),
+        imu.acceleration_body
+        + _noise(accelerometer_key, imu, noise.accelerometer_density, noise.accelerometer_walk),
+    )
+
+
+def _noise(key: PRNGKeyArray, imu: Imu, density: float, walk: float):
+    """White noise plus walking bias at the stamps, an array of the readings' own kind and precision."""
+    normal = jax.random.normal(key, (2, len(imu.t), 3), jnp.float32)
+    lib = np if isinstance(imu.omega_body, np.ndarray) else jnp
+    white, steps = lib.asarray(normal, imu.omega_body.dtype)
+    period = lib.diff(imu.t)[:, None].astype(imu.omega_body.dtype)
+    period = lib.concatenate([period[:1], period])
+    return density / lib.sqrt(period) * white + lib.cumsum(walk * lib.sqrt(period) * steps, axis=0)
+
+
+def _rotation_path(times: Float[np.ndarray, " n"], rotations: Rotation, kind: Literal["slerp", "spline"]):
+    """Orientation and body rate [rad/s] as functions of times."""
+    if kind == "spline":
+        spline = RotationSpline(times, rotations)
+        return spline, lambda t: spline(t, 1)
+    rates = (rotations[:-1].inv() * rotations[1:]).as_rotvec() / np.diff(times)[:, None]
+    interval = lambda t: np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(rates) - 1)
+    return Slerp(times, rotations), lambda t: rates[interval(t)]
+
+
+def _to_body(R_world_body, vector_world):
+    """R^T v for numpy and jax arrays alike; a sum of products, so never in TF32."""
+    return (R_world_body * vector_world[..., None]).sum(axis=-2)

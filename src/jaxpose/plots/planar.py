@@ -1,0 +1,90 @@
+"""Pictures of planar alignment: the neural image with its patches, and corner errors over steps."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from jaxtyping import Bool, Float
+from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from jaxpose.files.atomic import atomic
+from jaxpose.plots.slam import _STYLE, DPI, ESTIMATE, LOST
+
+_TRUTH, _START, _ESTIMATE = "#ffffff", "#f5c518", "#35c8f5"  # over a photograph, not over paper
+_FIELDS = {"posenet": ESTIMATE, "table": "#e0902f", "spline_reset": "#b5322d", "bspline": "#5a9e5a"}
+_FLOOR = 1e-3  # [px] of a logarithmic axis
+
+
+def reconstruction(
+    path: Path | str,
+    photograph: Float[np.ndarray, "h w 3"],
+    neural: Float[np.ndarray, "h w 3"],
+    covered: Bool[np.ndarray, "h w"],
+    outlines: Mapping[str, Float[np.ndarray, "n 4 2"]],
+    title: str,
+) -> None:
+    """A photograph with the outlines of its patches beside the neural image that was made from them.
+
+    Images are in [0, 1]; `outlines` are corners [px] under the names truth, start and estimate. What no patch
+    has `covered` is faded in both: nothing is known there.
+    """
+    fade = np.where(covered, 1.0, 0.3)[..., None]
+    height, width = photograph.shape[:2]
+    colours = {"truth": _TRUTH, "start": _START, "estimate": _ESTIMATE}
+    styles = {"truth": (3.4, "solid"), "start": (2.2, "dashed"), "estimate": (1.3, "solid")}
+    with matplotlib.rc_context(_STYLE):
+        figure = Figure(figsize=(12, 12 * 0.5 * height / width + 0.9), dpi=DPI, layout="constrained")
+        left, right = figure.subplots(1, 2)
+        for axes, picture, drawn, name in (
+            (left, photograph, ("truth", "estimate", "start"), "photograph, patches on it"),
+            (right, neural, ("estimate",), "neural image, from the patches alone"),
+        ):
+            axes.imshow(np.clip(picture, 0, 1) * fade, interpolation="nearest")
+            for key in drawn:
+                lw, style = styles[key]
+                axes.add_collection(
+                    PolyCollection(
+                        list(outlines[key] - 0.5), facecolors="none", edgecolors=colours[key], lw=lw, ls=style
+                    )
+                )
+            axes.set(title=name, xticks=[], yticks=[], xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
+            axes.grid(False)
+        keys = [Line2D([], [], color=colours[k], lw=styles[k][0], ls=styles[k][1], label=k) for k in outlines]
+        legend = figure.legend(handles=keys, loc="outside lower center", ncols=len(keys), frameon=True)
+        legend.get_frame().set(facecolor="#6b6b6b", edgecolor="none")
+        for text in legend.get_texts():
+            text.set_color("white")
+        figure.suptitle(title)
+        with atomic(path) as temporary:
+            figure.savefig(temporary)
+
+
+def corner_errors(
+    path: Path | str,
+    steps: Float[np.ndarray, " c"],
+    curves: Mapping[str, Float[np.ndarray, "m c"]],
+    success_px: float,
+    title: str,
+) -> None:
+    """Corner error [px] over steps: a thin line per motion, the median bold, a panel per pose field."""
+    with matplotlib.rc_context(_STYLE):
+        figure = Figure(figsize=(max(6.0, 3.6 * len(curves)), 4.2), dpi=DPI, layout="constrained")
+        panels: list[Axes] = list(figure.subplots(1, len(curves), sharey=True, squeeze=False)[0])
+        for axes, (name, errors) in zip(panels, curves.items(), strict=True):
+            colour = _FIELDS.get(name, ESTIMATE)
+            shown = np.maximum(errors, _FLOOR)
+            axes.plot(steps, shown.T, color=colour, lw=0.8, alpha=0.4)
+            axes.plot(steps, np.median(shown, axis=0), color=colour, lw=2.4, label="median")
+            axes.axhline(success_px, color=LOST, lw=1, ls="dashed", label=f"success: below {success_px:g} px")
+            won = int((errors[:, -1] < success_px).sum())
+            axes.set(yscale="log", xlabel="step", xlim=(steps[0], steps[-1]))
+            axes.set_title(f"{name}: {won} of {len(errors)} motions")
+        panels[0].set_ylabel("corner error [px]")
+        panels[0].legend(loc="lower left")
+        figure.suptitle(title)
+        with atomic(path) as temporary:
+            figure.savefig(temporary)

@@ -1,0 +1,1 @@
+"""The map: integrate, texture, mesh."""

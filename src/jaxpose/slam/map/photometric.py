@@ -1,0 +1,105 @@
+"""Mapping as in the paper: the scene is optimised on rays of the current frame and of keyframes beside it.
+
+`fuse.py` is the other way, and the default.
+"""
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from jaxpose.geometry.camera import Camera
+from jaxpose.losses import weighted_mean
+from jaxpose.render import Ray, composite, sdf_weights
+from jaxpose.scenes import SceneField
+from jaxpose.scenes.types import Params
+from jaxpose.slam.observation import Image, SampleConfig, depth_sigma, sample_depths, sample_pixels
+
+
+@dataclass(frozen=True)
+class MapConfig:
+    """How the scene is mapped; all but the first is of the method `gradient`."""
+
+    method: Literal["fused", "gradient"] = "fused"
+    pixels: int = 1000  # per iteration, shared by the frames of the window
+    edge: int = 4
+    window: int = 5  # frames: the current one, the last keyframe, and keyframes that overlap
+    iterations: int = 20
+    first_iterations: int = 200
+    learning_rate: float = 2e-3  # of Adam
+    first_rate: float = 5e-3
+    sample: SampleConfig = SampleConfig(front=8, surface=14, behind=0)
+
+
+class MapState(NamedTuple):
+    """The scene, and what the method remembers: Adam's moments, or the weight of each node."""
+
+    params: Params
+    memory: Any
+
+
+def make_descend(scene: SceneField, camera: Camera, config: MapConfig):
+    """`init(params)` and the compiled step `update(state, images, T_world_cam, far, rate, iterations, key)`.
+
+    `images` and `T_world_cam` are stacked over the window. The number of iterations is traced.
+    """
+    adam = optax.scale_by_adam(b2=0.99)
+    share = config.pixels // config.window
+
+    def loss_fn(params, images, T_world_cam, far, key):
+        def of_frame(key, image, pose):
+            pixels = sample_pixels(key, image, camera, share, edge=config.edge)
+            direction = jnp.einsum("ij,nj->ni", pose[:3, :3], pixels.direction_cam, precision="highest")
+            ray = Ray(jnp.broadcast_to(pose[:3, 3], direction.shape), direction)
+            losses, has_depth = jax.vmap(of_ray, in_axes=(0, 0, 0, None, None))(
+                ray, pixels.depth, pixels.rgb, far, params
+            )
+            return losses, has_depth
+
+        losses, has_depth = jax.vmap(of_frame)(jax.random.split(key, config.window), images, T_world_cam)
+        return weighted_mean(losses, has_depth)
+
+    def of_ray(ray, depth, rgb, far, params):
+        depths = sample_depths(depth, far, config.sample)
+        points = ray.origin[None] + depths[:, None] * ray.direction[None]
+        distance, colours = jax.vmap(partial(scene.query, params), in_axes=(0, None))(points, ray.direction)
+        weights = jax.lax.stop_gradient(sdf_weights(distance, depths, width=config.sample.width))
+        seen = composite(weights, depths, colours)
+        band = config.sample.band
+        target = jnp.clip(depth - depths, -band, band)
+        supervised = (depths <= depth + band).astype(distance.dtype)
+        # Near depth is worth more than far depth.
+        worth = (depth_sigma(jnp.ones(())) / depth_sigma(depth)) ** 2
+        loss = worth * jnp.sum(supervised * (distance - target) ** 2) + jnp.sum((seen.rgb - rgb) ** 2)
+        return loss, (depth > 0).astype(loss.dtype)
+
+    @partial(jax.jit, donate_argnums=0)
+    def update(
+        state: MapState,
+        images: Image,
+        T_world_cam: Float[Array, "k 4 4"],
+        far: Float[Array, ""],
+        rate: Float[Array, ""],
+        iterations: Int[Array, ""],
+        key: PRNGKeyArray,
+    ) -> tuple[MapState, Float[Array, ""]]:
+        def improve(i, carry):
+            (params, opt_state), _ = carry
+            loss, gradient = jax.value_and_grad(loss_fn)(
+                params, images, T_world_cam, far, jax.random.fold_in(key, i)
+            )
+            with jax.numpy_dtype_promotion("standard"):
+                direction, opt_state = adam.update(gradient, opt_state)
+            params = jax.tree.map(lambda p, d: p - rate * d, params, direction)
+            return MapState(params, opt_state), loss
+
+        return jax.lax.fori_loop(0, iterations, improve, (state, jnp.zeros(())))
+
+    def init(params: Params) -> MapState:
+        return MapState(params, adam.init(params))
+
+    return init, update

@@ -1,0 +1,1 @@
+"""Tracking: predict, register, relocalise."""

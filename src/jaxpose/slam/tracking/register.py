@@ -1,0 +1,181 @@
+"""Second-order alignment of one camera pose to the map: measured points are moved onto its surfaces.
+
+A point is where a pixel's ray ends at the measured depth; its residual is the signed distance that the map
+has there (Bylow et al. 2013), along the surface's normal, in sigmas. One look-up a pixel takes the place of
+the samples of a rendered ray, and the distance pulls from as far off as the map knows it.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxpose.geometry import se3
+from jaxpose.slam.map.integrate import Lookup
+from jaxpose.slam.observation import Pixels, back_project, depth_sigma
+from jaxpose.slam.tracking.objective import Residuals, TrackConfig, colour_spread, image_loss, median
+
+_SETTLED = 2e-4  # [m, rad] a step this small ends the alignment
+_INDEPENDENT = 100.0  # pixels
+_LONGEST = 0.2  # [m, rad] no step is longer
+_FLAT = 0.05  # a distance that changes less along a metre says nothing about the surface
+_DAMPING = 1e-4
+_BRIGHTER = 4.0  # times, at most, that one image is exposed longer than another
+
+
+class Alignment(NamedTuple):
+    """A pose, how well it explains the image, and the information the image holds about it."""
+
+    T_world_cam: Float[Array, "4 4"]
+    information: Float[Array, "6 6"]  # Gauss-Newton's matrix over right increments
+    loss: Float[Array, ""]
+    residuals: Residuals
+    iterations: Int[Array, ""]
+
+
+class Slopes(NamedTuple):
+    """Derivatives of residuals by right increments of the camera's pose."""
+
+    depth: Float[Array, "n 6"]
+    colour: Float[Array, "n 3 6"]
+
+
+def starts(T_ref_body: Float[Array, "4 4"], sigma: Float[Array, "2"]) -> Float[Array, "k 4 4"]:
+    """Motions to try first: the predicted one, and those `sigma` [m, rad] away along each axis."""
+    axes = jnp.concatenate([jnp.eye(6), -jnp.eye(6)]) * jnp.repeat(sigma, 3)[None]
+    return jnp.concatenate([T_ref_body[None], se3.compose(T_ref_body, se3.exp(axes))])
+
+
+def best_start(
+    look_up: Lookup, T_world_cam: Float[Array, "k 4 4"], pixels: Pixels, *, count: int = 150
+) -> Float[Array, "4 4"]:
+    """The candidate pose that explains the first `count` pixels best; unexplained ones count as bad."""
+    few = jax.tree.map(lambda x: x[:count], pixels)
+
+    def score(T):
+        near = jax.vmap(look_up)(back_project(few, T))
+        worst = 20.0
+        off = jnp.minimum(jnp.abs(near.distance) / depth_sigma(few.depth), worst)
+        return jnp.mean(jnp.where((near.known > 0) & (few.depth > 0), off, worst))
+
+    return T_world_cam[jnp.argmin(jax.lax.map(score, T_world_cam))]
+
+
+def surface_residuals(
+    look_up: Lookup, T_world_cam: Float[Array, "4 4"], pixels: Pixels, config: TrackConfig
+) -> tuple[Residuals, Slopes]:
+    """Residuals of measured points against the map's surface and its colour there, and their derivatives.
+
+    Outliers are points farther from it than its band and than three times the median: while the pose is far
+    off all points pull, in the end those near a surface.
+    """
+    points = back_project(pixels, T_world_cam)
+
+    def at(point):
+        near, change = jax.linearize(look_up, point)
+        return near, jax.vmap(change)(jnp.eye(3, dtype=point.dtype))
+
+    near, along = jax.vmap(at)(points)
+    steep = jnp.linalg.norm(along.distance, axis=-1)
+    known = (pixels.depth > 0) & (near.known > 0) & (steep > _FLAT)
+    steep = jnp.maximum(steep, _FLAT)
+    distance = near.distance / steep
+    away = jnp.abs(distance)
+    inlier = known & (away < jnp.maximum(config.sample.band, 3 * median(away, known)))
+    sigma = depth_sigma(pixels.depth)
+    coloured = inlier & (away < config.sample.band)
+    gain = exposure(near.rgb, pixels.rgb, coloured)
+    colour = near.rgb - gain[None] * pixels.rgb
+    colour_error, spread = colour_spread(colour, coloured)
+    colour = jnp.where(coloured[:, None], colour / spread, 0)
+    share = jnp.sum(inlier) / jnp.maximum(jnp.sum(pixels.depth > 0), 1)
+    weight, depth_error = inlier.astype(distance.dtype), median(away, inlier)
+    found = Residuals(distance / sigma, colour, weight, depth_error, colour_error, gain, share)
+
+    def by_pose(change):
+        """From derivatives (n, 3) by the point in the world."""
+        change_cam = jnp.matmul(change, T_world_cam[:3, :3], precision="highest")
+        point_cam = pixels.direction_cam * pixels.depth[:, None]
+        return jnp.concatenate([change_cam, jnp.cross(point_cam, change_cam)], axis=-1)
+
+    by_colour = jnp.where(coloured[:, None, None], along.rgb / spread, 0)
+    d_colour = jnp.stack([by_pose(by_colour[:, :, k]) for k in range(3)], axis=1)
+    return found, Slopes(by_pose(along.distance / (steep * sigma)[:, None]), d_colour)
+
+
+def exposure(
+    map_rgb: Float[Array, "n 3"], rgb: Float[Array, "n 3"], counts: Bool[Array, " n"]
+) -> Float[Array, "3"]:
+    """What an image's colours are to be multiplied by to be as bright as the map's, without gradient.
+
+    The ratio of their sums: of a product's least squares, noise and a wrong pose would make less.
+    """
+    total = lambda colour: jnp.sum(jnp.where(counts[:, None], jax.lax.stop_gradient(colour), 0), axis=0)
+    ratio = total(map_rgb) / jnp.maximum(total(rgb), 1e-6)
+    return jnp.clip(ratio, 1 / _BRIGHTER, _BRIGHTER)
+
+
+def align(
+    look_up: Lookup,
+    T_world_cam: Float[Array, "4 4"],
+    T_world_predicted: Float[Array, "4 4"],
+    sigma: Float[Array, "2"],
+    pixels: Pixels,
+    config: TrackConfig,
+) -> Alignment:
+    """The pose near a start that brings measured points onto the map's surface, by Gauss-Newton steps.
+
+    Residuals count by their size, within one sigma by their square: by squares throughout, a camera between
+    furniture was lost. The predicted pose is a measurement too, with `sigma` [m, rad]; against it the image
+    counts as `_INDEPENDENT` pixels, since errors of a map go together.
+    """
+    prior = jnp.repeat(sigma, 3) ** -2
+
+    def equations(T):
+        found, by = surface_residuals(look_up, T, pixels, config)
+        residual = jnp.concatenate([found.depth, found.colour.reshape(-1)])
+        slope = jnp.concatenate([by.depth, by.colour.reshape(-1, 6)])
+        w_depth = found.inlier / jnp.maximum(jnp.abs(found.depth), 1)
+        w_colour = config.colour_weight / 3 * found.inlier[:, None] / jnp.maximum(jnp.abs(found.colour), 1)
+        weighted = jnp.concatenate([w_depth, w_colour.reshape(-1)])[:, None] * slope
+        away = se3.log(se3.compose(se3.inverse(T_world_predicted), T))
+        expected = _weight(found) * prior
+        information = jnp.matmul(weighted.T, slope, precision="highest")
+        descent = jnp.matmul(residual, weighted, precision="highest") + expected * away
+        return information, jnp.diag(expected), descent, found
+
+    def improve(carry):
+        at, _ = carry
+        information, expected, descent, found = equations(at.T_world_cam)
+        total = information + expected
+        damped = total + _DAMPING * jnp.diag(jnp.diag(total)) + 1e-6 * jnp.eye(6)
+        step = -jnp.linalg.solve(damped, descent)
+        length = jnp.linalg.norm(step)
+        step = step * jnp.minimum(1, _LONGEST / jnp.maximum(length, 1e-12))
+        T = se3.compose(at.T_world_cam, se3.exp(step))
+        return Alignment(T, information, image_loss(found, config), found, at.iterations + 1), length
+
+    def unsettled(carry):
+        at, length = carry
+        return (at.iterations < config.iterations) & (length > _SETTLED)
+
+    count = pixels.depth.shape[0]
+    zero = jnp.zeros(())
+    nothing = Residuals(
+        jnp.zeros(count), jnp.zeros((count, 3)), jnp.zeros(count), zero, zero, jnp.ones(3), zero
+    )
+    start = Alignment(T_world_cam, jnp.zeros((6, 6)), jnp.zeros(()), nothing, jnp.int32(0))
+    return jax.lax.while_loop(unsettled, improve, (start, jnp.inf))[0]
+
+
+def pose_sigma(found: Alignment) -> Float[Array, "2"]:
+    """Standard deviation [m, rad] of an aligned pose along its worst axis, by the image alone."""
+    covariance = jnp.linalg.inv(found.information / _weight(found.residuals) + 1e-6 * jnp.eye(6))
+    worst = lambda block: jnp.sqrt(jnp.linalg.eigvalsh(block)[-1])
+    return jnp.stack([worst(covariance[:3, :3]), worst(covariance[3:, 3:])])
+
+
+def _weight(found: Residuals) -> Float[Array, ""]:
+    """How many times its own worth a pixel would count if none went together with another."""
+    return jnp.maximum(jnp.sum(found.inlier), 1) / _INDEPENDENT

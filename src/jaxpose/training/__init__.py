@@ -1,0 +1,1 @@
+"""Joint training of a scene and a pose field."""

@@ -1,0 +1,278 @@
+"""`jaxpose eval`: its numbers are evo's, its output states their protocol, a wrong call costs one line."""
+
+import copy
+import json
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from functools import partial
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import refused
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from jaxpose.cli import evaluate
+from jaxpose.cli import main as main_command
+from jaxpose.cli.evaluate import Config
+from jaxpose.errors import DataError
+from jaxpose.evaluation import trajectory_error
+from jaxpose.fields import numpy_evaluator, serialization
+from jaxpose.files import atomic, trajectories
+from jaxpose.geometry import rigid
+
+
+def paths(count=60, seed=0):
+    """A smooth trajectory of 3 s, and an estimate of it: jittered, drifting, scaled, elsewhere, late."""
+    rng = np.random.default_rng(seed)
+    t = 1.6e9 + np.linspace(0, 3, count)
+    s = t - t[0]
+    truth = np.tile(np.eye(4), (count, 1, 1))
+    truth[:, :3, :3] = Rotation.from_rotvec(np.stack([s, 0.5 * np.sin(s), 0.2 * s], -1)).as_matrix()
+    truth[:, :3, 3] = np.stack([2 * np.sin(s), np.cos(2 * s), 0.3 * s], -1)
+    estimate = truth.copy()
+    turned = Rotation.from_rotvec(0.03 * rng.normal(size=(count, 3))).as_matrix()
+    estimate[:, :3, :3] = truth[:, :3, :3] @ turned
+    estimate[:, :3, 3] += 0.02 * rng.normal(size=(count, 3)) + 0.02 * s[:, None]
+    estimate = trajectory_error.align(rigid.Similarity(0.7, turned[0], np.array([3.0, 1, 2])), estimate)
+    late = rng.uniform(-0.008, 0.008, count)
+    return trajectories.Trajectory(t, truth), trajectories.Trajectory(t + late, estimate)
+
+
+@pytest.fixture
+def files(tmp_path):
+    """Truth, and an estimate that lacks some poses and has others of times long after."""
+    truth, estimate = paths()
+    kept = np.setdiff1d(np.arange(60), [5, 6, 30])
+    t = np.append(estimate.t[kept], estimate.t[-1] + [5, 6])
+    T = np.concatenate([estimate.T[kept], estimate.T[:2]])
+    trajectories.write_tum(tmp_path / "truth.txt", truth)
+    trajectories.write_tum(tmp_path / "estimate.txt", trajectories.Trajectory(t, T))
+    return tmp_path / "estimate.txt", tmp_path / "truth.txt"
+
+
+def assert_agrees_with_evo(estimate, reference, align, most):
+    """Every number of every delta, to 1e-6."""
+    from evo.core import sync
+    from evo.core.metrics import APE, RPE, PoseRelation, StatisticsType, Unit
+    from evo.tools import file_interface
+
+    config = Config(
+        estimate, reference, align=align, max_difference=most, rpe_frames=(1, 10), rpe_metres=(0.5,)
+    )
+    ours = evaluate.run(config)
+    truth, found = (file_interface.read_tum_trajectory_file(file) for file in (reference, estimate))
+    truth, found = sync.associate_trajectories(truth, found, max_diff=most)
+    found = copy.deepcopy(found)
+    if align != "none":
+        found.align(truth, correct_scale=align == "sim3")
+    parts = {"m": PoseRelation.translation_part, "deg": PoseRelation.rotation_angle_deg}
+    pairs = [(ours.ate_m, APE(parts["m"])), (ours.rotation_deg, APE(parts["deg"]))]
+    units = {"frames": Unit.frames, "m": Unit.meters}
+    for rpe in ours.rpe:
+        if rpe.unit != "s":  # which evo does not have
+            for part, statistics in (("m", rpe.translation_m), ("deg", rpe.rotation_deg)):
+                pairs.append(
+                    (
+                        statistics,
+                        RPE(parts[part], rpe.delta, units[rpe.unit], 0.1, True, pairs_from_reference=True),
+                    )
+                )
+    assert len(pairs) == 8 and ours.pairs == truth.num_poses
+    for statistics, metric in pairs:
+        metric.process_data((truth, found))
+        for name in trajectory_error.Statistics._fields:
+            theirs = metric.get_statistic(StatisticsType[name])
+            assert getattr(statistics, name) == pytest.approx(theirs, abs=1e-6), (metric, name)
+    return ours
+
+
+@pytest.mark.parametrize("align", ["none", "se3", "sim3"])
+def test_numbers_are_evos(files, align):
+    ours = assert_agrees_with_evo(*files, align, 0.01)
+    assert ours.pairs == 57
+    assert ours.transform.scale == pytest.approx(1 / 0.7, rel=0.05) if align == "sim3" else 1
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("align", ["none", "se3", "sim3"])
+@pytest.mark.parametrize(
+    "estimate, reference, pairs",
+    [
+        ("fr2_desk_ORB.txt", "fr2_desk_groundtruth.txt", 2174),
+        ("freiburg1_xyz-rgbdslam.txt", "freiburg1_xyz-groundtruth.txt", 785),
+        ("freiburg1_xyz-rgbdslam_drift.txt", "freiburg1_xyz-groundtruth.txt", 785),
+    ],
+)
+def test_numbers_on_real_trajectories_are_evos(data_dir, estimate, reference, pairs, align):
+    folder = data_dir / "trajectories"
+    ours = assert_agrees_with_evo(folder / estimate, folder / reference, align, 0.01)
+    assert ours.pairs == pytest.approx(pairs, abs=5)
+
+
+def test_rpe_over_seconds_is_that_over_as_many_frames(files):
+    """At a steady rate, with a delta of which a tenth is less than a frame."""
+    truth, estimate = paths(61)
+    for file, trajectory in zip(files, (estimate, truth), strict=True):
+        trajectories.write_tum(file, trajectories.Trajectory(truth.t, trajectory.T))
+    by_frames, by_time = evaluate.run(Config(*files, rpe_frames=(5,), rpe_seconds=(0.25,))).rpe
+    np.testing.assert_allclose(by_time.translation_m, by_frames.translation_m, atol=1e-12)
+    assert (by_time.unit, by_time.delta, by_time.pairs) == ("s", 0.25, by_frames.pairs)
+
+
+def test_formats_do_not_change_the_numbers(files, tmp_path):
+    truth, estimate = paths()
+    expected = trajectory_error.ate(estimate.T, truth.T).rmse
+    trajectories.write_euroc(tmp_path / "truth.csv", truth)
+    trajectories.write_euroc(tmp_path / "estimate.csv", estimate)
+    trajectories.write_kitti(tmp_path / "kitti.txt", estimate.T)
+    np.savetxt(tmp_path / "list.txt", truth.T.reshape(-1, 4), fmt="%.17g")
+    for pair, how, said in (
+        (("estimate.csv", "truth.csv"), "nearest stamps, at most 0.01 s apart", "EuRoC file"),
+        (("kitti.txt", "truth.txt"), "row by row, as not both have stamps", "KITTI file"),
+        (("kitti.txt", "list.txt"), "row by row, as not both have stamps", "no stamps"),
+    ):
+        result = evaluate.run(Config(*(tmp_path / name for name in pair)))
+        assert result.ate_m.rmse == pytest.approx(expected, abs=1e-9)
+        text = evaluate.report(result)
+        assert how in text and said in text and "SE(3)" in text
+    assert result.notes == ("no stamps, so no RPE over seconds",)
+    assert [rpe.unit for rpe in result.rpe] == ["frames"]
+
+
+def test_clocks_that_differ(files):
+    estimate = trajectories.read_tum(files[0])
+    trajectories.write_tum(files[0], estimate._replace(t=estimate.t - 1.6e9))
+    with pytest.raises(DataError, match="expected stamps within 0.01 s"):
+        evaluate.run(Config(*files))
+    found = evaluate.run(Config(*files, time_offset=1.6e9))
+    trajectories.write_tum(files[0], estimate)
+    # Stamps since 1970 are rounded to 0.24 us, and at most that can pair others.
+    assert found.ate_m == pytest.approx(evaluate.run(Config(*files)).ate_m)
+    assert "the estimate's moved by 1.6e+09 s" in found.association
+
+
+@pytest.fixture
+def run_folder(tmp_path):
+    """What a run leaves of its trajectory: frames at 10 Hz, and a spline that is asked between them."""
+    folder = tmp_path / "run"
+    folder.mkdir()
+    span = (0.0, 3.0)
+    rng = np.random.default_rng(0)
+    points = np.cumsum(0.1 * rng.normal(size=(33, 7)), axis=0)
+    serialization.write_field(
+        folder / "field.npz", span, [serialization.bspline_factor(span, jnp.asarray(points))]
+    )
+    t = np.linspace(0, 3, 31)
+    trajectories.write_tum(
+        folder / "trajectory.txt", trajectories.Trajectory(t, numpy_evaluator.load(folder / "field.npz")(t))
+    )
+    atomic.write_json(folder / "results.json", {"experiment": "rgbd_slam"})
+    return folder
+
+
+def test_a_run_is_asked_at_the_references_own_stamps(run_folder, tmp_path):
+    """Exact where the nearest frame is as far off as the camera moves in that time."""
+    t = np.sort(np.random.default_rng(1).uniform(-0.2, 3.1, 100))
+    trajectories.write_tum(
+        tmp_path / "truth.txt", trajectories.Trajectory(t, numpy_evaluator.load(run_folder / "field.npz")(t))
+    )
+    config = Config(run_folder, tmp_path / "truth.txt", align="none", max_difference=0.05)
+    exact = evaluate.run(config)
+    inside = int(((t >= 0) & (t <= 3)).sum())
+    assert exact.pairs == inside < 100
+    assert exact.ate_m.max < 1e-9 and exact.rotation_deg.max < 1e-5
+    assert "exact: the continuous trajectory (field.npz) at the reference's stamps" in exact.association
+    assert f"; {100 - inside} stamps of the reference beyond its ends are left out" in exact.association
+    assert "rgbd_slam run, 31 poses" in exact.estimate
+    nearest = evaluate.run(replace(config, match="nearest"))
+    assert nearest.ate_m.max > 1e-3 and "nearest stamps, at most 0.05 s" in nearest.association
+    (run_folder / "field.npz").unlink()
+    assert evaluate.run(config).ate_m == nearest.ate_m
+    with pytest.raises(
+        DataError, match="field.npz: expected the continuous trajectory of the run, got nothing"
+    ):
+        evaluate.run(replace(config, match="exact"))
+
+
+def test_a_run_is_a_reference_too(run_folder):
+    result = evaluate.run(Config(run_folder / "trajectory.txt", run_folder))
+    assert result.ate_m.max < 1e-9 and result.pairs == 31
+
+
+def test_json_is_all_that_is_printed(files, capsys):
+    main_command.main(["eval", *map(str, files), "--json", "--align", "sim3", "--rpe-frames", "1", "5"])
+    said = capsys.readouterr()
+    assert said.err == ""
+    read, result = json.loads(said.out), evaluate.run(Config(*files, align="sim3", rpe_frames=(1, 5)))
+    assert read["ate_m"]["rmse"] == result.ate_m.rmse and read["alignment"] == "sim3"
+    assert [(rpe["delta"], rpe["unit"]) for rpe in read["rpe"]] == [(1, "frames"), (5, "frames"), (1, "s")]
+    assert np.array(read["transform"]["rotation"]).shape == (3, 3)
+
+
+def test_the_table(files, capsys, tmp_path):
+    plot = tmp_path / "errors.png"
+    main_command.main(["eval", *map(str, files), "--rpe-metres", "0.5", "100", "--plot", str(plot)])
+    text, result = capsys.readouterr().out, evaluate.run(Config(*files))
+    values = result.ate_m
+    cells = [line.split("|") for line in text.splitlines() if line.startswith("| ATE ")][0]
+    expected = [values.rmse, values.mean, values.median, values.max]
+    assert [float(cell) for cell in cells[3:7]] == pytest.approx(expected, abs=1e-6) and cells[
+        2
+    ].strip() == "m"
+    assert "57 of 59 poses of the shorter one: nearest stamps" in text and "TUM file, 59 poses" in text
+    assert "SE(3)" in text and "RPE over 0.5 m" in text and "RPE over 1 frame " in text
+    assert "RPE over 100 m: no two poses are that far apart, to a tenth" in text and str(plot) in text
+    with Image.open(plot) as image:
+        pixels = np.asarray(image.convert("RGB"))
+    assert image.format == "PNG" and len(np.unique(pixels.reshape(-1, 3), axis=0)) > 100
+
+
+complaint = partial(refused.complaint, main_command.main)
+
+
+def test_wrong_calls_cost_one_line(files, tmp_path):
+    estimate, truth = files
+    (tmp_path / "folder" / "none").mkdir(parents=True)
+    trajectories.write_tum(tmp_path / "folder" / "none" / "trajectory.txt", paths()[0])
+    trajectories.write_kitti(tmp_path / "kitti.txt", paths(10)[0].T)
+    (tmp_path / "broken").mkdir()
+    trajectories.write_tum(tmp_path / "broken" / "trajectory.txt", paths()[0])
+    (tmp_path / "broken" / "results.json").write_text("{")
+    for args, message in (
+        ([], "jaxpose: Expected one of .*eval, export"),
+        (["evaluate"], "eval"),
+        (["eval", truth], "Missing from jaxpose eval: REFERENCE"),
+        (["eval", truth, truth, "--aling", "se3"], "--align"),
+        (["eval", truth, truth, "--align", "affine"], "expected one of"),
+        (["eval", truth, truth, "--max-difference", "-1"], "--max-difference: expected 0 or more, got -1.0"),
+        (["eval", truth, truth, "--rpe-metres", "0"], "--rpe-metres: expected positive numbers, got 0.0"),
+        (["eval", truth, tmp_path / "x"], "x: expected a trajectory file or a run folder, got nothing"),
+        (["eval", tmp_path / "folder", truth], "with trajectory.txt, got runs in it: none"),
+        (["eval", tmp_path / "kitti.txt", truth], "kitti.txt: expected 60 poses, as .*, got 10"),
+        (["eval", truth, truth, "--match", "exact"], "expected a run folder with field.npz, got a TUM file"),
+        (["eval", truth, truth, "--plot", tmp_path / "no" / "p.png"], "No such file or directory"),
+        (["eval", truth, truth, "--plot", "p.jpg"], "--plot: expected a name that ends in .png, got p.jpg"),
+        (["eval", tmp_path / "broken", truth], "broken/results.json: expected the results of a run"),
+    ):  # fmt: skip
+        line = complaint(*args)
+        assert line.startswith("jaxpose") and re.search(message, line, re.IGNORECASE), line
+
+
+def test_help_is_quick_and_says_what_there_is():
+    """Without loading JAX or drawing; as `python -m jaxpose` too."""
+    code = (
+        "import sys\nfrom jaxpose import cli\ntry: cli.main(['eval', '--help'])\nexcept SystemExit: pass\n"
+        "print([name for name in ('jax', 'matplotlib', 'flax') if name in sys.modules])"
+    )
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert said.endswith("\n[]\n") and "usage: jaxpose eval" in said
+    for word in ("ESTIMATE", "REFERENCE", "--align {none,se3,sim3}", "--max-difference", "--json", "--plot"):
+        assert word in said
+    short = subprocess.run([sys.executable, "-m", "jaxpose", "--help"], capture_output=True, text=True)
+    assert short.returncode == 0 and "eval" in short.stdout and "export" in short.stdout
+    wrong = subprocess.run([sys.executable, "-m", "jaxpose", "eval", "a"], capture_output=True, text=True)
+    assert (wrong.returncode, wrong.stdout, len(wrong.stderr.splitlines())) == (1, "", 1)

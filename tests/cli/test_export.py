@@ -1,0 +1,225 @@
+"""`jaxpose export`: poses through every format and back, no motion that nobody measured, wrong calls."""
+
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from jaxpose.cli import export
+from jaxpose.cli import main as main_command
+from jaxpose.cli.export import Config
+from jaxpose.datasets.photos import blender
+from jaxpose.errors import DataError
+from jaxpose.fields import numpy_evaluator, serialization
+from jaxpose.files import atomic, trajectories, trajectory_reader
+from jaxpose.files.camera_json import read_camera, write_camera
+from jaxpose.geometry.camera import Camera
+
+COUNT, SPAN = 16, (0.0, 3.0)
+CAMERA = Camera(22.0, 21.0, 11.0, 7.5, 24, 16, (0.1, 0.0, 0.002, 0.01))
+
+
+@pytest.fixture
+def recording(tmp_path):
+    """Images on disk, twice as large as a run used them; names lack the suffix, as Blender's do."""
+    folder = tmp_path / "recording"
+    (folder / "train").mkdir(parents=True)
+    for k in range(COUNT):
+        Image.new("RGB", (48, 32), (k, 0, 0)).save(folder / "train" / f"r_{k}.png")
+    return folder
+
+
+@pytest.fixture
+def run(tmp_path, recording):
+    """What a run leaves: its frames' poses, the continuous trajectory near them, its camera."""
+    folder = tmp_path / "run"
+    folder.mkdir()
+    rng = np.random.default_rng(0)
+    points = np.cumsum(0.2 * rng.normal(size=(23, 7)), axis=0)
+    serialization.write_field(
+        folder / "field.npz", SPAN, [serialization.bspline_factor(SPAN, jnp.asarray(points))]
+    )
+    t = np.linspace(*SPAN, COUNT)
+    poses = numpy_evaluator.load(folder / "field.npz")(t)
+    poses[:, :3, :3] = poses[:, :3, :3] @ Rotation.from_rotvec(0.01 * rng.normal(size=(COUNT, 3))).as_matrix()
+    trajectories.write_tum(folder / "trajectory.txt", trajectories.Trajectory(t, poses))
+    atomic.write_json(folder / "results.json", {"experiment": "noisy_nerf"})
+    names = tuple(f"./train/r_{k}" for k in range(COUNT))
+    write_camera(folder / "camera.json", CAMERA, names, recording)
+    return folder
+
+
+def poses_of(run):
+    return trajectories.read_tum(run / "trajectory.txt")
+
+
+def exported(run, format, out, **options):
+    result = export.run(Config(run, format=format, out=out, **options))
+    assert result.out == out and out.exists()
+    return result
+
+
+@pytest.mark.parametrize("format, stamped", [("tum", True), ("euroc", True), ("kitti", False)])
+def test_poses_come_back_from_trajectory_files(run, tmp_path, format, stamped):
+    result = exported(run, format, tmp_path / "new" / "out")
+    read = trajectory_reader.read_trajectory(tmp_path / "new" / "out")
+    written = poses_of(run)
+    assert read.stamped == stamped and result.poses == COUNT
+    np.testing.assert_allclose(read.trajectory.T, written.T, atol=1e-12)
+    if stamped:
+        np.testing.assert_allclose(read.trajectory.t, written.t, rtol=0, atol=1e-9)
+    else:
+        assert "no stamps" in " ".join(result.notes)
+
+
+def test_poses_come_back_from_transforms(run, tmp_path):
+    result = exported(run, "transforms", tmp_path / "poses" / "transforms.json")
+    assert "48x32; the run used 24x16" in " ".join(result.notes)
+    parts = blender.load(tmp_path / "poses" / "transforms.json")  # which finds and opens the images
+    written = poses_of(run).T
+    assert sum(len(part.files) for part in parts) == COUNT
+    for part in parts:
+        assert part.camera[:6] == pytest.approx((44.0, 42.0, 22.5, 15.5, 48, 32))
+        for name, rgb, pose in zip(part.files, part.rgb, part.T_world_cam, strict=True):
+            k = int(rgb[0, 0, 0])  # each image holds its number
+            assert name.endswith(f"train/r_{k}.png")
+            np.testing.assert_allclose(pose, written[k], atol=1e-12)
+
+
+def test_poses_come_back_from_colmap(run, tmp_path):
+    exported(run, "colmap", tmp_path / "sparse" / "0")
+    read = pycolmap.Reconstruction(tmp_path / "sparse" / "0")
+    written = poses_of(run).T
+    assert len(read.images) == COUNT
+    for image in read.images.values():
+        pose = np.vstack([image.cam_from_world().inverse().matrix(), [0, 0, 0, 1]])
+        k = int(image.name.removeprefix("train/r_").removesuffix(".png"))
+        np.testing.assert_allclose(pose, written[k], atol=1e-12)
+    (camera,) = read.cameras.values()
+    assert camera.model.name == "OPENCV"
+    np.testing.assert_allclose(camera.params, [44, 42, 23, 16, 0.1, 0, 0.002, 0.01])
+
+
+def test_the_continuous_trajectory(run, tmp_path):
+    result = exported(run, "npz", tmp_path / "motion.npz")
+    times = np.linspace(-0.1, 3.1, 77)
+    field = numpy_evaluator.load(run / "field.npz")
+    np.testing.assert_array_equal(numpy_evaluator.load(tmp_path / "motion.npz")(times), field(times))
+    assert result.poses is None and result.times == "made for 0.000 to 3.000 s"
+
+
+def test_other_times(run, tmp_path):
+    field, out = numpy_evaluator.load(run / "field.npz"), tmp_path / "out.txt"
+    result = exported(run, "tum", out, rate_hz=40.0)
+    read = trajectories.read_tum(out)
+    np.testing.assert_allclose(read.t, np.arange(121) / 40)
+    np.testing.assert_allclose(read.T, field(read.t), atol=1e-12)
+    assert result.times == "of the continuous trajectory at 40 Hz"
+    (tmp_path / "stamps.csv").write_text("#ns\n" + "".join(f"{s}\n" for s in (-0.5, 0.25, 1.5, 3.0, 3.1)))
+    result = exported(run, "euroc", out, at=tmp_path / "stamps.csv")
+    read = trajectories.read_euroc(out)
+    np.testing.assert_allclose(read.t, [0.25, 1.5, 3.0])
+    np.testing.assert_allclose(read.T, field(read.t), atol=1e-12)
+    assert result.notes == ("2 of 5 stamps are beyond the ends of the run: left out",)
+    (tmp_path / "stamps.csv").write_text("7\n8\n")
+    with pytest.raises(DataError, match="expected stamps from 0.000 to 3.000 s, as the run has, got 7"):
+        export.run(Config(run, format="tum", out=out, at=tmp_path / "stamps.csv"))
+
+
+def test_a_trajectory_file_has_its_own_stamps_only(run, tmp_path):
+    file, out = run / "trajectory.txt", tmp_path / "out"
+    written = trajectories.read_tum(file)
+    exported(file, "euroc", out)
+    np.testing.assert_allclose(trajectories.read_euroc(out).T, written.T, atol=1e-12)
+    (tmp_path / "some.txt").write_text("".join(f"{t!r} x.png\n" for t in written.t[[1, 4, 5]].tolist()))
+    exported(file, "tum", out, at=tmp_path / "some.txt")
+    np.testing.assert_allclose(trajectories.read_tum(out).T, written.T[[1, 4, 5]], atol=1e-12)
+    (tmp_path / "between.txt").write_text(f"{written.t[1] + 0.01}\n")
+    out.unlink()
+    for options, message in (
+        (
+            {"at": tmp_path / "between.txt"},
+            "between.txt: expected stamps of .*, as its motion between",
+        ),
+        ({"rate_hz": 5.0}, "trajectory.txt: expected a run folder with field.npz, got a TUM file"),
+    ):
+        with pytest.raises(DataError, match=message):
+            export.run(Config(file, format="tum", out=out, **options))
+    for format in ("npz", "colmap", "transforms"):
+        with pytest.raises(DataError, match="trajectory.txt: expected a run folder"):
+            export.run(Config(file, format=format, out=out))
+    trajectories.write_kitti(tmp_path / "kitti", written.T)
+    with pytest.raises(DataError, match="kitti: expected stamps for --format tum, got a KITTI file"):
+        export.run(Config(tmp_path / "kitti", format="tum", out=out))
+    assert not out.exists()
+
+
+def test_images_that_are_not_there(run, recording, tmp_path):
+    """Names and camera as the run had them, and a word on it; made up only where there never were any."""
+    (recording / "train" / "r_3.png").unlink()
+    result = exported(run, "transforms", tmp_path / "t.json")
+    assert "not all images are in" in result.notes[0]
+    frames = json.loads((tmp_path / "t.json").read_text())
+    assert frames["frames"][3]["file_path"] == "train/r_3" and frames["w"] == 24
+    write_camera(run / "camera.json", CAMERA, (), ".")
+    result = exported(run, "colmap", tmp_path / "sparse")
+    assert "names are made up" in result.notes[0]
+    names = {image.name for image in pycolmap.Reconstruction(tmp_path / "sparse").images.values()}
+    assert names == {f"frame-{k:06d}.png" for k in range(COUNT)}
+
+
+def test_runs_of_before(run, tmp_path):
+    (run / "camera.json").unlink()
+    with pytest.raises(DataError, match="camera.json: expected the camera of a run, got nothing"):
+        export.run(Config(run, format="colmap", out=tmp_path / "sparse"))
+    np.savez(run / "field.npz", control_points=np.zeros((5, 7)), span=np.array([0.0, 3.0]))
+    with pytest.raises(
+        DataError, match="field.npz: expected a trajectory of version 1, got none .what older runs left"
+    ):
+        export.run(Config(run, format="npz", out=tmp_path / "motion.npz"))
+    (run / "field.npz").write_bytes(b"half a file")
+    with pytest.raises(DataError, match="field.npz: "):
+        export.run(Config(run, format="npz", out=tmp_path / "motion.npz"))
+    exported(run, "tum", tmp_path / "still.txt")
+    assert [path.name for path in tmp_path.glob("*.npz")] == []
+
+
+def test_camera_files(tmp_path):
+    write_camera(tmp_path / "camera.json", CAMERA, ("a.png", "b.png"), "images")
+    assert read_camera(tmp_path / "camera.json") == (CAMERA, ("a.png", "b.png"), tmp_path / "images")
+    for text in (
+        "{",
+        "[]",
+        '{"images": []}',
+        '{"images": [], "images_folder": ".", "distortion": [], "f": 1}',
+    ):
+        (tmp_path / "camera.json").write_text(text)
+        with pytest.raises(DataError, match="camera.json: expected the camera of a run, got"):
+            read_camera(tmp_path / "camera.json")
+
+
+def test_the_command(run, tmp_path, capsys):
+    out = tmp_path / "out.txt"
+    main_command.main(["export", str(run), "--format", "tum", "--out", str(out), "--rate-hz", "2"])
+    said = capsys.readouterr().out
+    assert "noisy_nerf run, 16 poses, 0.000 to 3.000 s" in said and f"{out}  tum, 7 poses" in said
+    main_command.main(["export", str(run), "--format", "kitti", "--out", str(out), "--json"])
+    read = json.loads(capsys.readouterr().out)
+    assert (read["format"], read["poses"], read["out"]) == ("kitti", COUNT, str(out))
+    for args, message in (
+        (["--format", "tum"], "Missing from jaxpose export: --out"),
+        (["--format", "tmu", "--out", "x"], "invalid choice 'tmu'"),
+        (["--format", "tum", "--out", "x", "--rate-hz", "0"], "--rate-hz: expected a positive number"),
+        (["--format", "tum", "--out", "x", "--rate-hz", "1", "--at", "y"], "--at: expected no --rate-hz"),
+        (["--format", "colmap", "--out", "x", "--rate-hz", "5"], "--format colmap: expected no --rate-hz"),
+        (["--format", "npz", "--out", "x", "--at", "y"], "--format npz: expected no --rate-hz and no --at"),
+        (["--format", "tum", "--out", "x", "--at", str(tmp_path / "y")], "No such file"),
+    ):  # fmt: skip
+        with pytest.raises(SystemExit) as stop:
+            main_command.main(["export", str(run), *args])
+        line = stop.value.code
+        assert isinstance(line, str) and "\n" not in line and message in line, line

@@ -1,0 +1,320 @@
+"""The noisy-pose command: what it starts from, its fields and studies, its run folder, killed and resumed."""
+
+import json
+import re
+from dataclasses import replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import refused
+from helpers.killed import whole_and_killed
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy.interpolate import splrep
+
+from jaxpose.datasets.photos import blender
+from jaxpose.evaluation import trajectory_error
+from jaxpose.experiments import training_loop
+from jaxpose.experiments.noisy_nerf import pipeline as noisy_nerf
+from jaxpose.experiments.noisy_nerf.options import Config, load
+from jaxpose.experiments.noisy_nerf.report import report, table
+from jaxpose.experiments.noisy_nerf.setup import _SMOKE, build, splined
+from jaxpose.experiments.noisy_nerf.studies import STUDIES
+from jaxpose.experiments.training_loop import NetConfig
+from jaxpose.fields import numpy_evaluator
+from jaxpose.fields.serialization import write_field
+from jaxpose.files import atomic, trajectories
+from jaxpose.files.camera_json import read_camera
+from jaxpose.geometry import rigid
+
+FILES = {
+    "config.json", "settings.json", "results.json", "checkpoint.npz", "start.npz", "trajectory.txt",
+    "reference.txt", "cameras.png", "held_out.png", "curves.png", "transforms_train.json",
+    "transforms_test.json", "train", "held_out", "field.npz", "camera.json",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module", autouse=True)
+def compile_quickly():
+    """Most of a small run is compilation, and here nobody waits for what comes of it."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+
+
+def smoke(**changes):
+    return Config(smoke=True, settle_steps=2, **changes)
+
+
+complaint = partial(refused.complaint, noisy_nerf.main)
+
+
+# --- what a training starts from -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("side", ["world", "camera"])
+def test_noise_is_on_the_side_and_as_large_as_stated(side):
+    problem = load(smoke(noise_translation=0.1, noise_rotation_deg=30.0, side=side, seed=3))
+    truth = problem.train.T_world_cam
+    assert problem.extent == 8
+    to_start = (
+        problem.T_start @ np.linalg.inv(truth) if side == "world" else np.linalg.inv(truth) @ problem.T_start
+    )
+    off = to_start if side == "camera" else np.linalg.inv(to_start)  # world-to-camera: T_c,w . T_noise
+    assert np.linalg.norm(off[:, :3, 3], axis=1).max() == pytest.approx(0.8)
+    assert rigid.rotation_angle_deg(off[:, :3, :3], np.tile(np.eye(3), (8, 1, 1))).max() == pytest.approx(30)
+    assert side in problem.about["noise"] and "seed 3" in problem.about["noise"]
+    assert_array_equal(
+        load(smoke(noise_translation=0.1, noise_rotation_deg=30.0, side=side, seed=3)).T_start,
+        problem.T_start,
+    )
+    assert (
+        np.abs(load(smoke(noise_translation=0.1, side=side, seed=4)).T_start - problem.T_start).max() > 0.01
+    )
+
+
+def test_other_starts():
+    none, unknown = load(smoke(noise="none")), load(smoke(noise="unknown"))
+    assert_array_equal(none.T_start, none.train.T_world_cam)
+    at_rest = np.tile(np.eye(4), (8, 1, 1))
+    at_rest[:, 2, 3] = -(unknown.train.near + unknown.train.far) / 2  # the origin in the middle of the depths
+    assert_allclose(unknown.T_start, at_rest, rtol=1e-12)
+    independent = load(smoke(noise="independent", noise_sigma=0.01))
+    assert 0 < np.abs(independent.T_start - none.T_start).max() < 0.2
+    assert len(load(smoke(every=2)).train.t) == 4
+
+
+@pytest.mark.parametrize("pose", ["posenet", "table", "bspline", "spline_reset"])
+def test_every_field_starts_at_the_noisy_poses(pose):
+    config = smoke(pose=pose)
+    problem = load(config)
+    setup = build(config, problem)
+    poses = training_loop.pose_reader(setup.field, problem.train.t)(setup.field.init(jax.random.key(0)))
+    assert_allclose(poses, problem.T_start, atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"pose": "table", "side": "camera"},
+        {"pose": "spline_reset"},
+        {"pose": "bspline", "side": "camera"},
+        {"net": NetConfig(window=(0.1, 0.6))},
+        {"net": NetConfig(coupled=True, activation="softplus"), "side": "camera"},
+    ],
+    ids=["table", "spline_reset", "bspline", "window", "coupled"],
+)
+def test_every_field_is_a_file_for_numpy(tmp_path, changes):
+    """To what float32 leaves of a field over 8 scene units; `test_io_field` holds them to 1e-9 in float64."""
+    config = smoke(noise_rotation_deg=20.0, **changes)
+    problem = load(config)
+    setup = build(config, problem)
+    leaves, tree = jax.tree.flatten(setup.field.init(jax.random.key(0)))
+    rng = np.random.default_rng(0)
+    leaves = [leaf + jnp.asarray(0.1 * rng.normal(size=leaf.shape), leaf.dtype) for leaf in leaves]
+    params = jax.tree.unflatten(tree, leaves)
+    span = (float(problem.train.t[0]), float(problem.train.t[-1]))
+    write_field(tmp_path / "field.npz", span, setup.factors(params))
+    t = np.linspace(span[0] - 0.1, span[1] + 0.1, 41).astype(np.float32)
+    poses = np.asarray(jax.jit(jax.vmap(setup.field.pose, (None, 0)))(params, jnp.asarray(t)))
+    assert_allclose(numpy_evaluator.load(tmp_path / "field.npz")(t), poses, atol=1e-5)
+
+
+def test_a_table_reset_to_a_spline():
+    t = np.linspace(0, 5, 60)
+    clean = np.stack([np.sin(t + k) for k in range(6)], axis=-1)
+    rough = clean + 0.05 * np.random.default_rng(0).normal(size=clean.shape)
+    smooth = np.asarray(splined(jnp.asarray(rough, jnp.float32), t, 25, 60 * 0.05**2))
+    assert np.abs(smooth - clean).max() < 0.6 * np.abs(rough - clean).max()
+    # scipy's older routine finds the same bound with its own choice of knots.
+    for found, column in zip(smooth.T, rough.T, strict=True):
+        squares = ((found - column) ** 2).sum()
+        assert squares == pytest.approx(60 * 0.05**2, rel=0.05)
+        assert len(splrep(t, column, s=60 * 0.05**2)[0]) < 25 + 8
+    few = np.asarray(splined(jnp.asarray(rough, jnp.float32), t, 2, 1e-3))
+    assert ((few - rough) ** 2).sum() > 1.5 * ((smooth - rough) ** 2).sum(), "two knots cannot follow"
+
+
+def test_studies_are_the_papers_tables():
+    base = Config(seed=5)
+    sizes = {name: len(study(base)) for name, study in STUDIES.items()}
+    assert sizes == {"fields": 4, "encoding": 9, "size": 4, "spline": 6, "ablations": 18}
+    assert all(config.seed == 5 for study in STUDIES.values() for config in study(base).values())
+    assert STUDIES["encoding"](base)["sin5-D"].net == NetConfig() == STUDIES["size"](base)["8x256"].net
+
+
+# --- the run folder --------------------------------------------------------------------------------------
+
+
+def numbers(results):
+    """What must not depend on how a run was cut into pieces."""
+    keys = ("rotation_error_deg", "translation_error", "centre_error", "psnr", "ssim", "settled")
+    history = np.array(results["history"], float)[:, :4]
+    return {key: results[key] for key in keys} | {"history": history.tolist()}
+
+
+@pytest.mark.slow
+def test_a_killed_run_resumed_has_the_numbers_of_a_whole_one(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("jaxpose.experiments.noisy_nerf.setup._SMOKE", build_three_chunks())
+    monkeypatch.setattr("jaxpose.experiments.training_loop._SAVE_EVERY_S", 0.0)
+    whole = noisy_nerf.run(smoke(pose="spline_reset", out=tmp_path / "whole"))
+    assert {path.name for path in whole.folder.iterdir()} == FILES
+    assert json.loads((whole.folder / "results.json").read_text()) == json.loads(
+        json.dumps(atomic._plain(whole.results))
+    )
+
+    class Killed(Exception):
+        pass
+
+    def kill(progress):
+        if progress.step == 200:
+            raise Killed
+
+    out = tmp_path / "cut"
+    with pytest.raises(Killed):
+        noisy_nerf.run(smoke(pose="spline_reset", out=out), kill)
+    assert (out / "checkpoint.npz").exists() and not (out / "results.json").exists()
+    again = ["--smoke", "--settle-steps", "2", "--pose", "spline_reset", "--out", str(out), "--resume"]
+    noisy_nerf.main(again)
+    said = capsys.readouterr()
+    assert "SMOKE" in said.out and str(out) in said.out and "| spline_reset" in said.out
+    resumed = json.loads((out / "results.json").read_text())
+    assert numbers(resumed) == numbers(json.loads((whole.folder / "results.json").read_text()))
+    assert "expected --seed 0, as it began, got 1" in complaint(*again, "--seed", 1)
+    changed = (out / "results.json").stat().st_mtime_ns
+    noisy_nerf.main(again)
+    assert (out / "results.json").stat().st_mtime_ns == changed, "a finished run is not done again"
+    (out / "results.json").unlink()
+    (out / "checkpoint.npz").write_bytes(b"half a file")
+    assert "checkpoint.npz: expected a checkpoint" in complaint(*again)
+
+
+def build_three_chunks():
+    return replace(_SMOKE, steps=300, rays=16)
+
+
+@pytest.mark.slow
+def test_sigkill_in_the_middle_changes_no_number(tmp_path):
+    args = "--orbit-views 10 --image-width 24 --rays 256 --settle-steps 2"
+    whole, killed = whole_and_killed("noisy_nerf", args, 1500, tmp_path)
+    assert numbers(killed) == numbers(whole)
+
+
+def test_what_a_run_leaves(tmp_path):
+    outcome = noisy_nerf.run(smoke(out=tmp_path / "run", noise_translation=0.05))
+    results = outcome.results
+    trajectory, reference = (
+        trajectories.read_tum(outcome.folder / f"{name}.txt") for name in ("trajectory", "reference")
+    )
+    problem = load(smoke(noise_translation=0.05))
+    assert_allclose(reference.T, problem.train.T_world_cam, atol=1e-12)
+    assert_allclose(trajectory.t, problem.train.t)
+    errors = trajectory_error.pose_errors(trajectory.T, reference.T)
+    assert errors.rotation_deg == pytest.approx(results["rotation_error_deg"], rel=1e-6)
+    assert errors.translation == pytest.approx(results["translation_error"], rel=1e-6)
+    # The refined poses are a data set that this project, and others, can load.
+    train, held_out = blender.load(outcome.folder)
+    assert_allclose(train.T_world_cam, trajectory.T, atol=1e-9)
+    assert_array_equal(train.rgb, problem.train.rgb)
+    assert_allclose(held_out.T_world_cam, problem.held_out.T_world_cam, atol=1e-9)
+    assert_allclose(np.load(outcome.folder / "start.npz")["T_world_cam"], problem.T_start)
+    assert results["lpips"] is None and "n/a" in report(*outcome), (
+        "images of 24 pixels are too small for LPIPS"
+    )
+    loaded = noisy_nerf.load_run(outcome.folder)
+    poses = training_loop.pose_reader(loaded.setup.field, loaded.problem.train.t)(loaded.state.pose)
+    assert trajectory_error.pose_errors(poses, reference.T).rotation_deg == pytest.approx(
+        errors.rotation_deg, rel=1e-4
+    )
+    t = np.linspace(0, problem.train.t[-1], 30).astype(np.float32)
+    anywhere = jax.jit(jax.vmap(loaded.setup.field.pose, (None, 0)))(loaded.state.pose, jnp.asarray(t))
+    aligned = trajectory_error.align(
+        trajectory_error.procrustes(poses, reference.T), np.asarray(anywhere, np.float64)
+    )
+    assert_allclose(numpy_evaluator.load(outcome.folder / "field.npz")(t), aligned, atol=3e-5)
+    camera, images, folder = read_camera(outcome.folder / "camera.json")
+    assert camera == problem.train.camera and images == problem.train.files and folder == outcome.folder
+    density, _ = loaded.setup.scene.query(loaded.state.scene, jnp.zeros(3), jnp.ones(3))
+    assert np.isfinite(density) and float(loaded.state.scene["progress"]) == 1
+    assert results["settled"]["psnr"] > 0 and results["wall_s"] > 0 and results["versions"]["jax"]
+
+
+@pytest.mark.slow
+def test_a_study_puts_runs_side_by_side(tmp_path, monkeypatch):
+    every = STUDIES["fields"]
+    two = lambda config: {name: every(config)[name] for name in ("table", "bspline")}
+    monkeypatch.setitem(noisy_nerf.STUDIES, "fields", two)
+    seen = []
+    outcome = noisy_nerf.run(
+        smoke(study="fields", out=tmp_path / "both"), lambda progress: seen.append(progress.label)
+    )
+    assert {path.name for path in outcome.folder.iterdir()} == {
+        "table", "bspline", "table.md", "curves.png", "config.json", "results.json",
+    }  # fmt: skip
+    assert seen == ["table", "bspline"] and set(outcome.results["runs"]) == {"table", "bspline"}
+    assert table(outcome.results["runs"]) in report(*outcome)
+    assert (
+        json.loads((outcome.folder / "bspline" / "results.json").read_text())["training"]["pose"] == "bspline"
+    )
+
+
+@pytest.mark.data
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("scene", "noise", "views"), [("nerf_synthetic_lego", "independent", 8), ("llff_fern", "unknown", 8)]
+)
+def test_real_photographs(data_dir, tmp_path, scene, noise, views):
+    config = smoke(data=data_dir / scene, noise=noise, out=tmp_path / "run", pose="table")
+    results = noisy_nerf.run(config).results
+    assert results["data"]["images"] == views and results["rotation_error_deg"] < 180
+    poses = json.loads((tmp_path / "run" / "transforms.json").read_text())["frames"]
+    assert len(poses) == views
+
+
+@pytest.mark.data
+def test_unknown_poses_start_before_the_middle_of_disparity(data_dir):
+    problem = load(smoke(data=data_dir / "llff_fern", noise="unknown"))
+    assert_allclose(problem.T_start[:, :3, 3], [[0, 0, -2]] * 8, rtol=1e-6)  # of disparities 1 to 0
+
+
+@pytest.mark.data
+@pytest.mark.slow
+def test_unknown_poses_of_a_forward_facing_scene_are_found(data_dir, tmp_path):
+    config = Config(data=data_dir / "llff_fern", noise="unknown", steps=1000, settle_steps=0, out=tmp_path)
+    results = noisy_nerf.run(config).results
+    assert results["start"]["translation_error_percent"] > 25
+    assert results["translation_error_percent"] < 8 and results["rotation_error_deg"] < 20
+
+
+# --- what is not possible --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("args", "expected"),
+    [
+        (["--pose", "spline"], r"spline"),
+        (["--steps", "150"], r"--steps: expected a multiple of 100, got 150"),
+        (["--every", "0"], r"--every: expected at least 1, got 0"),
+        (["--noise-rotation-deg", "200"], r"--noise-rotation-deg: expected at most 180, got 200"),
+        (["--noise-translation", "-0.1"], r"--noise-translation: expected at least 0, got -0.1"),
+        (["--noise-sigma", "nan"], r"--noise-sigma: expected at least 0, got nan"),
+        (["--spline-smoothing", "0"], r"--spline-smoothing: expected a positive number, got 0"),
+        (["--data", "nowhere"], r"nowhere: expected a folder of photographs, or orbit, got nothing"),
+        (["--resume"], r"--resume: expected --out DIR or --name NAME"),
+        (["--smoke", "--every", "5"], r"expected at least 4 images to train on, got 2"),
+    ],
+)
+def test_bad_options_are_one_line(args, expected, tmp_path):
+    out = [] if "--resume" in args else ["--out", tmp_path / "out"]
+    line = complaint(*args, *out)
+    assert line.startswith("noisy_nerf: ")
+    assert re.search(expected, line), line
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_of_nothing_names_what_was_expected(tmp_path):
+    (tmp_path / "data").mkdir()
+    line = complaint("--data", tmp_path / "data", "--out", tmp_path / "out")
+    assert "transforms" in line and "poses_bounds.npy" in line

@@ -1,0 +1,304 @@
+"""The SLAM commands: smoke runs with their run folders, and bad input that ends in one line."""
+
+import json
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers.refused import complaint
+from PIL import Image
+
+from jaxpose.datasets.synthetic import RoomConfig, room
+from jaxpose.datasets.types import Recording
+from jaxpose.errors import DataError
+from jaxpose.evaluation import trajectory_error
+from jaxpose.experiments import imu_slam, rgbd_slam
+from jaxpose.experiments.slam import pipeline as slam_pipeline
+from jaxpose.experiments.slam.options import load
+from jaxpose.experiments.slam.report import report, table
+from jaxpose.fields import numpy_evaluator
+from jaxpose.files import atomic, trajectories
+from jaxpose.files.camera_json import read_camera
+
+README = Path(__file__).parents[2] / "README.md"
+FRAMES = 8
+PICTURES = {"trajectory.png", "errors.png", "renders.png"}
+FILES = PICTURES | {
+    "config.json", "results.json", "trajectory.txt", "reference.txt", "field.npz", "camera.json",
+    "map.npz", "mesh.ply", "points.ply", "preview.png", "settings.json",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module", autouse=True)
+def compile_quickly():
+    """Most of a smoke run is compilation, and here nobody waits for what comes of it."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+
+
+@pytest.fixture(scope="module")
+def recording() -> Recording:
+    return room(RoomConfig(duration_s=(FRAMES - 1) / 5, width=80, height=60, holes=False))
+
+
+@pytest.fixture
+def folder(tmp_path, recording) -> Path:
+    """A small recording in the layout of 7-Scenes, in a folder that a test may damage."""
+    path = tmp_path / "office" / "seq-01"
+    path.mkdir(parents=True)
+    camera = recording.camera
+    K = [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]
+    np.savetxt(path / "camera-intrinsics.txt", K)
+    for i in range(FRAMES):
+        frame = recording.read(i)
+        Image.fromarray(frame.rgb).save(path / f"frame-{i:06d}.color.png")
+        Image.fromarray((1000 * frame.depth).astype(np.uint16)).save(path / f"frame-{i:06d}.depth.png")
+        np.savetxt(path / f"frame-{i:06d}.pose.txt", recording.T_world_cam[i])
+    return path
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory) -> slam_pipeline.Outcome:
+    """`imu_slam --smoke`."""
+    out = tmp_path_factory.mktemp("runs") / "imu"
+    return imu_slam.run(imu_slam.Config(smoke=True, out=out))
+
+
+def test_run_folder_of_imu_slam(finished):
+    folder, results = finished
+    assert {path.name for path in folder.iterdir()} == FILES | {"inertial.png"}
+    assert json.loads((folder / "results.json").read_text()) == json.loads(json.dumps(atomic._plain(results)))
+    assert results["frames"] == FRAMES and results["frames_lost"] == 0
+    assert results["alignment"] == "se3" and results["imu"]["mode"] == "combined"
+    assert "200 Hz" in results["imu"]["readings"]
+    assert results["wall_s"] > 0 and results["peak_rss_bytes"] > 2**20
+    config = json.loads((folder / "config.json").read_text())
+    assert config["slam"]["imu"] == "combined" and config["smoke"] is True
+    for picture in PICTURES | {"inertial.png"}:
+        with Image.open(folder / picture) as image:
+            assert image.width >= 1000
+
+
+def test_numbers_are_those_of_the_files(finished):
+    folder, results = finished
+    estimate, truth = (
+        trajectories.read_tum(folder / "trajectory.txt"),
+        trajectories.read_tum(folder / "reference.txt"),
+    )
+    assert results["ate_rmse_m"] == pytest.approx(trajectory_error.ate(estimate.T, truth.T).rmse, abs=1e-9)
+    assert results["ate_rmse_m"] < 0.02
+    np.testing.assert_allclose(estimate.t, np.arange(FRAMES) / 5)
+
+
+def test_a_saved_field_gives_the_trajectory_at_any_time(finished):
+    folder, results = finished
+    field, params = slam_pipeline.load_field(folder)
+    estimate = trajectories.read_tum(folder / "trajectory.txt")
+    times = np.concatenate([estimate.t, np.linspace(0, estimate.t[-1], 50)]).astype(np.float32)
+    poses = np.asarray(jax.jit(jax.vmap(field.pose, (None, 0)))(params, jnp.asarray(times)))
+    distance = np.linalg.norm(poses[:FRAMES, :3, 3] - estimate.T[:, :3, 3], axis=1)
+    assert np.sqrt(np.mean(distance**2)) == pytest.approx(results["field_rmse_m"], abs=1e-5)
+    np.testing.assert_allclose(numpy_evaluator.load(folder / "field.npz")(times), poses, atol=1e-6)
+
+
+def test_a_field_of_before_is_refused(tmp_path):
+    np.savez(tmp_path / "field.npz", control_points=np.zeros((5, 7)), span=np.zeros(2))
+    with pytest.raises(DataError, match="field.npz: expected a B-spline in a trajectory of version 1"):
+        slam_pipeline.load_field(tmp_path)
+
+
+def test_a_run_says_what_camera_it_had(finished):
+    camera, images, _ = read_camera(finished.folder / "camera.json")
+    assert (camera.width, camera.height, images) == (80, 60, ())
+
+
+def test_report_states_numbers_with_their_protocol(finished):
+    text = report(*finished)
+    assert f"{100 * finished.results['ate_rmse_m']:.2f} cm  SE(3) alignment, 8 of 8 frames" in text
+    assert "SMOKE" in text and str(finished.folder) in text and "trajectory.png" in text
+    assert f"0 of {FRAMES} frames" in text
+
+
+@pytest.mark.slow
+def test_rgbd_slam_on_a_folder(folder, tmp_path, capsys):
+    out = tmp_path / "run"
+    rgbd_slam.main(
+        ["--data", str(folder), "--recorded-hz", "5", "--smoke", "--frame", "intrinsic", "--out", str(out)]
+    )
+    said = capsys.readouterr()
+    assert "office/seq-01" in said.out and "IMU none" in said.out
+    assert "8/8" in said.err  # the bar
+    assert {path.name for path in out.iterdir()} == FILES | {"freedom.png"}  # and no picture of an IMU
+    results = json.loads((out / "results.json").read_text())
+    dof = results["degrees_of_freedom"]
+    assert dof["after_mean"] < dof["before_mean"] <= 6 and "in the intrinsic frame" in said.out
+    assert results["ate_rmse_m"] < 0.02
+    assert results["imu"] == {"mode": "none", "readings": "not used"}
+    camera, images, where = read_camera(out / "camera.json")
+    assert images == tuple(f"frame-{k:06d}.color.png" for k in range(FRAMES)) and (camera.width, where) == (
+        80,
+        folder,
+    )
+
+
+def test_compare_runs_every_mode(finished, tmp_path, monkeypatch, recording):
+    modes = []
+
+    def quick(used, config, on_frame, state):
+        modes.append(config.imu)
+        field, params = slam_pipeline.load_field(finished.folder)
+        poses = trajectories.read_tum(finished.folder / "trajectory.txt").T
+        return slam_pipeline.SlamResult(
+            poses, np.full_like(poses, np.nan), *np.zeros((2, FRAMES), bool), np.ones(FRAMES, bool),
+            np.ones(FRAMES, int), *np.ones((4, FRAMES)), np.ones((FRAMES, 2)), np.ones(FRAMES),
+            None, None, (np.zeros(1),) * 2,
+            np.zeros(0, int), field, params, 0.0, 0.0,
+        )  # fmt: skip
+
+    monkeypatch.setattr(slam_pipeline, "track", quick)
+    monkeypatch.setattr(slam_pipeline, "inertial", lambda *args: None)
+    monkeypatch.setattr(slam_pipeline, "_draw", lambda *args: None)
+    monkeypatch.setattr(slam_pipeline, "_write_surface", lambda *args: ())
+    monkeypatch.setattr(slam_pipeline, "write_map", lambda *args: None)
+    monkeypatch.setattr(slam_pipeline, "renderer", lambda *args: None)
+    monkeypatch.setattr(slam_pipeline, "map_quality", lambda *args: {"mapped": None, "held_out": None})
+    outcome = imu_slam.run(imu_slam.Config(smoke=True, compare=True, out=tmp_path / "all"))
+    assert modes == ["none", "loose", "tight", "accelerometer", "combined"]
+    assert {p.name for p in outcome.folder.iterdir()} == {
+        *modes, "config.json", "results.json", "table.md", "comparison.png",
+    }  # fmt: skip
+    for mode in modes:
+        config = json.loads((outcome.folder / mode / "config.json").read_text())
+        assert config["slam"]["imu"] == mode and config["compare"] is False
+    rows = (outcome.folder / "table.md").read_text().splitlines()
+    assert len(rows) == 2 + len(modes)
+    assert table(outcome.results["modes"]) in report(*outcome)
+
+
+def test_imu_is_simulated_before_thinning(folder):
+    whole = load(imu_slam.Config(data=folder, recorded_hz=5.0))
+    thinned = load(imu_slam.Config(data=folder, recorded_hz=5.0, rate_hz=2.5, start=2))
+    assert len(whole.recording.t) == 8 and len(thinned.recording.t) == 3
+    assert thinned.recording.t[0] == 0  # the clock starts at the first frame used
+    assert whole.recording.imu is not None and thinned.recording.imu is not None
+    np.testing.assert_array_equal(whole.recording.imu.omega_body, thinned.recording.imu.omega_body)
+    np.testing.assert_allclose(thinned.recording.imu.t, whole.recording.imu.t - 0.4, atol=1e-12)
+    assert "simulated at 200 Hz" in thinned.imu and "slerp" in thinned.imu
+    spline = load(imu_slam.Config(data=folder, recorded_hz=5.0, imu_rotation="spline"))
+    assert spline.recording.imu is not None
+    assert np.abs(spline.recording.imu.omega_body - whole.recording.imu.omega_body).max() > 1e-3
+
+
+@pytest.mark.parametrize(
+    "args, expected",
+    [
+        (["--daat", "x"], r"Unrecognized options: --daat.*--data"),
+        (["--imu", "gyro"], r"invalid choice 'gyro'.*'none', 'loose', 'tight'"),
+        (["--frames", "many"], r"--frames.*many"),
+        (["--rate-hz", "0"], r"--rate-hz: expected a positive number, got 0"),
+        (["--recorded-hz", "-3"], r"--recorded-hz: expected a positive number, got -3"),
+        (["--start", "-1"], r"--start: expected 0 or more, got -1"),
+        (["--frames", "2"], r"--frames: expected at least 3, got 2"),
+        (["--voxel", "0"], r"--voxel: expected a positive number, got 0"),
+        (["--room.width", "0"], r"RoomConfig.width: expected a positive number, got 0"),
+        (["--rate-hz", "0.01"], r"expected two frames"),
+        (["--format", "sevenscenes"], r"expected --data"),
+        (["--format", "room", "--data", "x"], r"expected no --data"),
+        (["--room.along", "x", "--data", "y"], r"--room\.along: expected no --data"),
+        (["--imu-offset-s", "nan"], r"--imu-offset-s: expected a finite number"),
+        (["--data", "nowhere"], r"nowhere: expected a folder of frame-NNNNNN.*got nothing"),
+    ],
+)
+def test_bad_options_are_one_line(args, expected, tmp_path):
+    line = complaint(imu_slam.main, *args, "--out", tmp_path / "out")
+    assert line.startswith("imu_slam: ")
+    assert re.search(expected, line), line
+    assert not (tmp_path / "out").exists()
+
+
+def test_bad_recordings_are_one_line(folder, tmp_path):
+    out = tmp_path / "out"
+    ask = lambda *args, main=rgbd_slam.main: complaint(
+        main, "--data", folder, "--recorded-hz", 5, "--out", out, *args
+    )
+    assert "expected --start below 8, the frames it has, got 8" in ask("--start", 8)
+    assert "expected --frames of at most 6, those from --start 2 on, got 7" in ask(
+        "--start", 2, "--frames", 7
+    )
+    assert "expected at least 3 frames to track, got 2" in ask("--rate-hz", 1)
+    for i in range(3, FRAMES):
+        (folder / f"frame-{i:06d}.pose.txt").unlink()
+    line = ask("--start", 5, main=imu_slam.main)
+    assert re.search(r"IMU: expected readings between 0.000 and 0.400 s .*between -1.000 and -0.600", line), (
+        line
+    )
+    for i in range(3):
+        (folder / f"frame-{i:06d}.pose.txt").unlink()
+    assert "--imu combined expected true poses to simulate an IMU from" in ask(main=imu_slam.main)
+    assert "--compare expected true poses" in ask("--compare")
+    no_depth = Image.fromarray(np.zeros((60, 80), np.uint16))
+    no_depth.save(folder / "frame-000000.depth.png")
+    assert "expected depth in the first frame" in ask()  # found only when tracking starts
+    for i in range(FRAMES):
+        no_depth.save(folder / f"frame-{i:06d}.depth.png")
+    assert "expected depth in mm" in ask()
+    assert not out.exists()
+
+
+def test_output_that_cannot_be_written(folder, tmp_path):
+    (tmp_path / "file").write_text("mine")
+    line = complaint(rgbd_slam.main, "--data", folder, "--out", tmp_path / "file" / "run")
+    assert str(tmp_path / "file") in line
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_a_failed_run_takes_away_only_what_it_made(folder, tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "mine.txt").write_text("mine")
+    Image.fromarray(np.zeros((60, 80), np.uint16)).save(folder / "frame-000000.depth.png")
+    complaint(rgbd_slam.main, "--data", folder, "--out", out)
+    assert [path.name for path in out.iterdir()] == ["mine.txt"]
+
+
+def test_exit_code_and_streams():
+    command = [sys.executable, "-m", "jaxpose.experiments.imu_slam", "--sed", "3"]
+    bad = subprocess.run(command, capture_output=True, text=True)
+    assert bad.returncode == 1 and bad.stdout == ""
+    assert len(bad.stderr.splitlines()) == 1 and "--seed" in bad.stderr
+
+
+def test_help_lists_the_options(capsys):
+    with pytest.raises(SystemExit) as stop:
+        imu_slam.main(["--help"])
+    assert not stop.value.code
+    said = capsys.readouterr()
+    assert said.err == "" and "usage: python -m jaxpose.experiments.imu_slam" in said.out
+    options = "--data --format --imu --frame --rate-hz --start --frames --seed --compare --smoke --out --name"
+    for option in options.split():
+        assert f" {option}" in said.out
+
+
+def test_defaults():
+    assert imu_slam.Config().slam.imu == "combined" and rgbd_slam.Config().slam.imu == "none"
+    assert imu_slam.Config().slam == replace(rgbd_slam.Config().slam, imu="combined")
+
+
+def test_readme():
+    text = README.read_text()
+    assert "pip install -e . && python -m jaxpose.experiments.imu_slam\n" in text
+    assert 'pip install -e ".[test]" && pytest\n' in text
+    blocks = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    assert blocks
+    with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):  # as users have it
+        for block in blocks:
+            exec(compile(block, str(README), "exec"), {})
+    for path in re.findall(r"`(src/jaxpose/[\w/.]*|tests/|experiments/)`", text):
+        assert (README.parent / path).exists(), path

@@ -1,0 +1,96 @@
+"""Tangent planes of depth images: walls in closed form, edges, noise."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers.wall import CAMERA, rays, wall
+from numpy.testing import assert_allclose, assert_array_equal
+
+from jaxpose.geometry.camera import Camera
+from jaxpose.slam.map.normals import seen_by, tangent_planes
+from jaxpose.slam.observation import Image, depth_sigma, locate
+
+ACROSS = np.array([0.0, 0, -1])
+
+
+def planes(depth, camera=CAMERA):
+    return np.asarray(jax.jit(tangent_planes, static_argnums=1)(jnp.asarray(depth), camera))
+
+
+@pytest.mark.parametrize("normal", [(0, 0, -1), (0.3, -0.2, -1), (0.0, 0.9, -1)])
+def test_a_wall_is_its_own_plane_up_to_the_border(normal):
+    depth, unit = wall(normal, 1.4)
+    found = planes(depth)
+    inner = found[1:-1, 1:-1]
+    assert_allclose(inner[..., :3], np.broadcast_to(unit, inner[..., :3].shape), atol=2e-4)
+    assert_allclose(inner[..., 3], 1.4, atol=1e-3)
+
+
+def test_a_lens_that_distorts_bends_the_normal_by_little_and_the_point_stays():
+    camera = Camera(60.0, 60.0, 31.5, 23.5, 64, 48, (-0.1, 0.02, 0.0, 0.0))
+    depth, unit = wall((0.3, -0.2, -1), 1.4, camera)
+    found = planes(depth, camera)
+    assert (found[1:-1, 1:-1, :3] @ unit).min() > np.cos(np.deg2rad(6))
+    points = depth[..., None] * rays(camera)
+    assert_allclose(np.sum(found[..., :3] * points, -1) + found[..., 3], 0, atol=1e-5)
+
+
+def test_no_slope_is_taken_across_an_edge():
+    near, unit = wall((0.3, 0, -1), 1.0)
+    far, other = wall((-0.2, 0.1, -1), 2.5)
+    left = np.arange(64) < 30
+    found = planes(np.where(left, near, far))[8:-8]
+    for side, normal in ((found[:, 1:29], unit), (found[:, 31:63], other)):
+        towards = side[..., :3] @ normal
+        known = np.abs(side[..., 2] + 1) > 1e-6
+        assert known.mean() > 0.95
+        assert np.median(towards[known]) > np.cos(np.deg2rad(0.1))
+        assert np.percentile(towards[known], 2) > np.cos(np.deg2rad(25))
+
+
+def test_noise_turns_a_plane_by_a_few_degrees():
+    depth, unit = wall((0.3, -0.2, -1), 1.8)
+    noisy = depth + np.asarray(depth_sigma(jnp.asarray(depth))) * np.random.default_rng(0).normal(
+        size=depth.shape
+    )
+    found = planes(noisy.astype(np.float32))
+    known = np.abs(found[..., 2] + 1) > 1e-6
+    assert known[1:-1, 1:-1].mean() > 0.95
+    off = np.rad2deg(np.arccos(np.clip(found[known][:, :3] @ unit, -1, 1)))
+    assert np.median(off) < 3
+
+
+def test_where_little_is_known_the_plane_is_across_the_axis():
+    depth, _ = wall((0.3, -0.2, -1), 1.4)
+    alone = np.zeros_like(depth)
+    alone[::5, ::5] = depth[::5, ::5]
+    grazing, _ = wall((0, 1, -0.02), 0.3)
+    found = planes(alone)
+    assert_array_equal(found[..., :3], np.broadcast_to(ACROSS, (48, 64, 3)))
+    assert_allclose(found[..., 3], alone, rtol=1e-6)
+    steep = (grazing > 3) & (grazing < 50)
+    assert steep.sum() > 100
+    assert_array_equal(
+        planes(np.where(steep, grazing, 0))[..., :3][steep], np.broadcast_to(ACROSS, (steep.sum(), 3))
+    )
+
+
+def test_what_pixels_say_of_points():
+    """Distance to a slanted wall and worth in closed form; nothing outside and where there is no depth."""
+    depth, unit = wall((0.3, -0.2, -1), 1.4)
+    depth[:, 50:] = 0
+    image = Image(jnp.full((48, 64, 3), 51, jnp.uint8), jnp.asarray(depth))
+    points = np.random.default_rng(0).uniform([-0.4, -0.3, 1.0], [0.25, 0.3, 1.8], (50, 3)).astype(np.float32)
+    at = locate(CAMERA, jnp.asarray(points))
+    seen = jax.jit(lambda: seen_by(image, CAMERA)(at))()
+    assert_allclose(seen.distance(jnp.asarray(points)), points @ unit + 1.4, atol=1e-3)
+    assert_allclose(seen.facing(jnp.asarray(points)), -points @ unit, atol=1e-3)
+    ray = rays()[np.asarray(at.row), np.asarray(at.column)]
+    cosine = -(ray @ unit) / np.linalg.norm(ray, axis=-1)
+    there = depth[np.asarray(at.row), np.asarray(at.column)]
+    sigma = lambda z: 0.0012 + 0.0019 * (z - 0.4) ** 2
+    assert_allclose(seen.worth, cosine * (sigma(1.0) / sigma(there)) ** 2, rtol=2e-3)
+    assert_allclose(seen.rgb, 0.2, rtol=1e-6)
+    nowhere = jnp.array([[5.0, 0, 1], [0, 0, -1], [0.42, 0, 1]])
+    assert_array_equal(seen_by(image, CAMERA)(locate(CAMERA, nowhere)).worth, 0)

@@ -1,0 +1,82 @@
+"""A run that is killed goes on where it was; what is damaged or of another run is refused."""
+
+import json
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from jaxpose.errors import DataError
+from jaxpose.experiments import rgbd_slam
+from jaxpose.experiments.slam.options import load, slam_config
+from jaxpose.files import trajectories
+from jaxpose.slam import checkpoint
+from jaxpose.slam.map.photometric import MapConfig
+from jaxpose.slam.pipeline import SlamConfig, begin
+from jaxpose.slam.system import make_system
+
+KILLED = """
+import os, signal, sys
+import jax
+jax.config.update("jax_disable_most_optimizations", True)
+from pathlib import Path
+from jaxpose.experiments import rgbd_slam, slam_keep
+slam_keep.SAVE_EVERY_S = 0.0
+def on_frame(mode, progress):
+    if len(sys.argv) > 2 and progress.index == 4:
+        os.kill(os.getpid(), signal.SIGKILL)
+config = rgbd_slam.Config(smoke=True, out=Path(sys.argv[1]), resume=True)
+rgbd_slam.run(config, on_frame)
+"""
+
+
+@pytest.mark.slow
+def test_a_killed_run_goes_on_and_ends_as_if_nothing_had_been(tmp_path):
+    def run(folder, *kill):
+        return subprocess.run([sys.executable, "-c", KILLED, tmp_path / folder, *kill]).returncode
+
+    assert run("killed", "kill") == -signal.SIGKILL
+    left = {path.name for path in (tmp_path / "killed").iterdir()}
+    assert {"checkpoint.npz", "settings.json", "preview.png"} <= left and "results.json" not in left
+    with np.load(tmp_path / "killed" / "checkpoint.npz") as file:
+        assert file[".done"] == 5 or file[".done"] == 4
+    assert run("killed") == 0 and run("whole") == 0
+    killed, whole = (
+        trajectories.read_tum(tmp_path / name / "trajectory.txt") for name in ("killed", "whole")
+    )
+    np.testing.assert_allclose(killed.T, whole.T, atol=1e-6)
+    numbers = [json.loads((tmp_path / name / "results.json").read_text()) for name in ("killed", "whole")]
+    assert numbers[0]["ate_rmse_m"] == pytest.approx(numbers[1]["ate_rmse_m"], abs=1e-6)
+    assert numbers[0]["keyframes"] == numbers[1]["keyframes"]
+    assert not (tmp_path / "killed" / "checkpoint.npz").exists()
+    before = (tmp_path / "killed" / "results.json").stat().st_mtime_ns
+    assert run("killed") == 0  # finished: nothing is done again
+    assert (tmp_path / "killed" / "results.json").stat().st_mtime_ns == before
+
+
+@pytest.mark.parametrize("method", ["fused", "gradient"])
+def test_a_checkpoint_holds_the_whole_state(method, tmp_path):
+    options = rgbd_slam.Config(smoke=True, slam=SlamConfig(voxel=0.2, map=MapConfig(method=method)))
+    system = make_system(load(options).recording, slam_config(options))
+    state = begin(system)._replace(done=3, far=2.5)
+    state = state._replace(frames=state.frames.put(2, lost=True, loss=0.7, sigma=[0.1, 0.2]))
+    checkpoint.save(tmp_path / "c.npz", state)
+    found = checkpoint.load(tmp_path / "c.npz", system)
+    assert (found.done, found.far, found.grid) == (3, 2.5, state.grid)
+    for name, value in state.frames._asdict().items():
+        np.testing.assert_array_equal(getattr(found.frames, name), value, err_msg=name)
+    np.testing.assert_array_equal(found.map.params[0], state.map.params[0])
+    other = make_system(system.recording._replace(t=np.arange(9) / 5), system.config)
+    with pytest.raises(DataError, match="c.npz: expected"):
+        checkpoint.load(tmp_path / "c.npz", other)
+    (tmp_path / "c.npz").write_bytes(b"PK\3\4 not a checkpoint")
+    with pytest.raises(DataError, match="c.npz: expected a checkpoint"):
+        checkpoint.load(tmp_path / "c.npz", system)
+
+
+def test_other_settings_are_not_resumed(tmp_path):
+    (tmp_path / "settings.json").write_text(json.dumps({"seed": 3}))
+    with pytest.raises(DataError, match="expected --"):
+        rgbd_slam.run(rgbd_slam.Config(smoke=True, out=tmp_path, resume=True))
