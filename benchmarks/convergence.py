@@ -2,7 +2,8 @@
 
 The room and the loss of `tracking.py`. Every start is off by a random motion; an iteration draws new pixels
 and takes one step of Adam, on six free numbers (a twist) or on a PoseNet brought to the start first.
-Converged is where the pose stays within `--metres` and `--degrees` of the truth for the rest of the way.
+Converged is where the pose stays within `--metres` and `--degrees` of the ground truth for the rest of the
+way.
 
     python benchmarks/convergence.py --help
 """
@@ -17,7 +18,7 @@ import tyro
 from timing import machine
 from tracking import FIELDS, make_loss, room
 
-from jaxpose.fields import pin, posenet
+from jaxpose.fields import posenet, project_onto_poses
 from jaxpose.geometry import se3
 from jaxpose.geometry.rigid import rotation_angle_deg
 from jaxpose.slam.tracking.objective import TrackConfig
@@ -60,7 +61,7 @@ def make_descent(scene, pose_of, rates, config: Config):
 
 
 def converged(poses: np.ndarray, config: Config) -> float:
-    """The first iteration from which on the poses are near the truth, which is the identity; inf: none."""
+    """The first iteration from which on the poses are near ground truth, which is the identity; inf: none."""
     angle = rotation_angle_deg(poses[:, :3, :3], np.tile(np.eye(3), (len(poses), 1, 1)))
     near = (np.linalg.norm(poses[:, :3, 3], axis=1) < config.metres) & (angle < config.degrees)
     far = np.flatnonzero(~near)
@@ -78,26 +79,26 @@ def main() -> None:
     for name, settings in FIELDS.items():
         field = posenet(settings)
         first = field.init(jax.random.key(0))
-        bring = jax.jit(
-            lambda twist, field=field, first=first: pin(
+        fit = jax.jit(
+            lambda twist, field=field, first=first: project_onto_poses(
                 lambda p: field.pose(p, t)[None], first, se3.exp(twist)[None]
             )
         )
         rates = {"translation": 1.0, "rotation": 0.2}  # METHOD section 2: 1e-3 and 2e-4
         rates = {part: jax.tree.map(lambda _, r=r: r, first[part]) for part, r in rates.items()}
-        variants[name] = (lambda params, field=field: field.pose(params, t), bring, rates)
+        variants[name] = (lambda params, field=field: field.pose(params, t), fit, rates)
     print(machine())
     print(
         f"{config.starts} starts off by {config.off_metres:g} m and {config.off_degrees:g} deg an axis, "
         f"{config.rays} rays x 48 samples; iterations until within {config.metres:g} m and "
         f"{config.degrees:g} deg for good, median (middle half):"
     )
-    for name, (pose_of, bring, rates) in variants.items():
+    for name, (pose_of, fit, rates) in variants.items():
         descent = make_descent(scene, pose_of, rates, config)
         for rate in (5e-4, 1e-3, 2e-3):
             found = []
             for k, start in enumerate(starts):
-                params = bring(jnp.asarray(start, jnp.float32))
+                params = fit(jnp.asarray(start, jnp.float32))
                 poses = descent(params, scene_params, image, jax.random.key(k), jnp.float32(rate))
                 found.append(converged(np.asarray(poses, np.float64), config))
             low, middle, high = np.percentile(found, [25, 50, 75], method="nearest")

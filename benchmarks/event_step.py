@@ -16,7 +16,7 @@ import tyro
 from timing import in_turn, machine, milliseconds, product_gflops
 
 from jaxpose import fields, scenes
-from jaxpose.events import Streams
+from jaxpose.events import PixelIndex
 from jaxpose.files import run_folder
 from jaxpose.geometry.camera import Camera
 from jaxpose.training import events as event_training
@@ -51,7 +51,9 @@ def data(count: int) -> EventData:
     level = np.cumsum(generator.choice([-1, 1], count))
     first = np.cumsum(per_pixel) - per_pixel
     whole = lambda x: jnp.asarray(x, jnp.int32)
-    streams = Streams(jnp.asarray(t, jnp.float32), whole(pixel), whole(level), whole(first), whole(per_pixel))
+    streams = PixelIndex(
+        jnp.asarray(t, jnp.float32), whole(pixel), whole(level), whole(first), whole(per_pixel)
+    )
     return EventData(streams, jnp.ones((WIDTH * HEIGHT, 3)))
 
 

@@ -1,9 +1,10 @@
 """A recording of a sensor that is not the synthetic room's own, along a hand-held motion that was recorded.
 
-The synthetic room is rendered at 640 x 480 along the poses of a TUM file (such as the truth of freiburg1_xyz)
-and written as a plain folder for `python -m jaxpose.experiments.rgbd_slam --data DIR`. Colour is blurred by
-the motion, exposed differently as time goes on, stored as JPEG and shifted by some pixels against depth;
-depth comes from disparities in steps, with noise that is the same over neighbouring pixels, and ends.
+The synthetic room is rendered at 640 x 480 along the poses of a TUM file (such as the ground truth of
+freiburg1_xyz) and written as a plain folder for `python -m jaxpose.experiments.rgbd_slam --data DIR`. Colour
+is blurred by the motion, exposed differently as time goes on, stored as JPEG and shifted by some pixels
+against depth; depth comes from disparities in steps, with noise that is the same over neighbouring pixels,
+and ends.
 
     python benchmarks/other_sensor.py --help
 """
@@ -49,7 +50,7 @@ class Config:
 
 
 def moved_to_the_room(trajectory: trajectories.Trajectory) -> Interpolant:
-    """The path over time since the first stamp, its middle above that of the floor."""
+    """The path over time since the first timestamp, its middle above that of the floor."""
     T = trajectory.T.copy()
     T[:, :2, 3] -= (T[:, :2, 3].min(axis=0) + T[:, :2, 3].max(axis=0)) / 2
     return interpolant(trajectory.t - trajectory.t[0], T)
@@ -65,16 +66,18 @@ def measured(depth: np.ndarray, rng: np.random.Generator, config: Config) -> np.
 
 def main() -> None:
     config = tyro.cli(Config, description=__doc__)
-    path = moved_to_the_room(trajectories.read_tum(config.trajectory, first_of_equal=True))
+    path = moved_to_the_room(trajectories.read_tum(config.trajectory, first_of_repeated=True))
     camera = Camera(FOCAL, FOCAL, 318.6, 241.3, 640, 480)
     shapes, atlas = scenery(config.seed, SIZE)
     seen = lambda T: [np.asarray(x) for x in render(camera, shapes, atlas, np.float32(T))]
     for kind in ("color", "depth"):
         (config.out / kind).mkdir(parents=True, exist_ok=True)
     last = min(config.duration_s, path.last - config.start_s - 2 * config.exposure_s)
-    stamps = config.start_s + config.exposure_s + np.arange(int(last * config.rate_hz) + 1) / config.rate_hz
-    poses = path.pose(stamps)
-    for i, t in enumerate(tqdm(stamps)):
+    timestamps = (
+        config.start_s + config.exposure_s + np.arange(int(last * config.rate_hz) + 1) / config.rate_hz
+    )
+    poses = path.pose(timestamps)
+    for i, t in enumerate(tqdm(timestamps)):
         _, depth, cosine = seen(poses[i])
         while_open = path.pose(t + config.exposure_s * np.linspace(-0.5, 0.5, 5))
         colour = np.mean([seen(T)[0].astype(np.float64) for T in while_open], axis=0)
@@ -85,14 +88,14 @@ def main() -> None:
         iio.imwrite(config.out / f"color/{i:05d}.jpg", np.clip(colour, 0, 255).astype(np.uint8), quality=90)
         iio.imwrite(config.out / f"depth/{i:05d}.png", np.round(1000 * found).astype(np.uint16))
     np.savetxt(config.out / "poses.txt", poses.reshape(-1, 16))
-    np.savetxt(config.out / "times.txt", stamps)
+    np.savetxt(config.out / "times.txt", timestamps)
     pinhole = dict(zip(camera._fields[:6], camera[:6], strict=True))
     (config.out / "intrinsics.json").write_text(json.dumps({**pinhole, "depth_scale": 1000}))
     metres = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     degrees = rotation_angle_deg(poses[:-1, :3, :3], poses[1:, :3, :3])
     print(
-        f"wrote {len(stamps)} frames to {config.out}; from one to the next {100 * np.median(metres):.1f} cm "
-        f"and {np.median(degrees):.1f} deg (medians)"
+        f"wrote {len(timestamps)} frames to {config.out}; from one to the next "
+        f"{100 * np.median(metres):.1f} cm and {np.median(degrees):.1f} deg (medians)"
     )
 
 

@@ -20,7 +20,7 @@ from jaxpose.datasets.types import Frame
 from jaxpose.fields import PoseNetConfig, posenet
 from jaxpose.geometry import se3
 from jaxpose.geometry.camera import Camera
-from jaxpose.scenes import box, grid, node_positions
+from jaxpose.scenes import bounding_grid, grid, node_positions
 from jaxpose.slam.observation import SampleConfig, sample_pixels, to_device
 from jaxpose.slam.tracking.objective import TrackConfig, image_loss, image_residuals
 
@@ -45,7 +45,7 @@ class Config:
 
 def room() -> tuple:
     """A box-shaped room of coloured walls on about 400,000 nodes: the scene, its parameters, one image."""
-    config = box(np.stack([-HALF, HALF]), levels=1)
+    config = bounding_grid(np.stack([-HALF, HALF]), levels=1)
     nodes = node_positions(config)
     distance = np.clip((HALF - np.abs(nodes)).min(axis=-1), -config.truncation, config.truncation)
     values = np.concatenate([distance[..., None], colour(nodes)], axis=-1)

@@ -1,4 +1,4 @@
-"""SLAM with a real IMU or its stand-in where no pose is known: the truth is taken away, and only measures.
+"""SLAM with a real IMU or its stand-in where no pose is known: ground truth is taken away, and only measures.
 
 Options are those of `python -m jaxpose.experiments.imu_slam`. Printed are the world's tilt against the true
 vertical, the ATE after SE(3) alignment, frames lost and uncertain, and how the errors of colour compare to
@@ -22,13 +22,13 @@ RIGHT = 0.04  # [m] of a motion from one frame to the next
 def main() -> None:
     config = tyro.cli(Config, description=__doc__)
     recording = load(config).recording
-    truth = recording.T_world_cam
-    assert truth is not None, "expected a recording with true poses to measure against"
+    ground_truth = recording.T_world_cam
+    assert ground_truth is not None, "expected a recording with true poses to measure against"
     recording = recording._replace(T_world_cam=None)
-    up = first_pose(recording).T_world_cam[2, :3] @ truth[0, 2, :3]
+    up = first_pose(recording).T_world_cam[2, :3] @ ground_truth[0, 2, :3]
     result = run(recording, slam_config(config))
-    ate = trajectory_error.ate(result.T_world_cam, truth)
-    moved, moved_true = (np.linalg.inv(T[:-1]) @ T[1:] for T in (result.T_world_cam, truth))
+    ate = trajectory_error.ate(result.T_world_cam, ground_truth)
+    moved, moved_true = (np.linalg.inv(T[:-1]) @ T[1:] for T in (result.T_world_cam, ground_truth))
     right = np.linalg.norm((moved - moved_true)[:, :3, 3], axis=1) < RIGHT
     ratio = result.colour_error[1:] / np.nanmedian(result.colour_error)
     print(f"{recording.name}, {len(recording.t)} frames, IMU {config.slam.imu}, seed {config.slam.seed}")

@@ -26,7 +26,7 @@ def corner(point, direction):
     return jnp.min(WALLS - point), 0.5 + 0.3 * jnp.sin(4 * point)
 
 
-def truth(t):
+def ground_truth(t):
     """Their camera: a swing and a slow turn, as a plain function."""
     c, s = jnp.cos(0.15 * t), jnp.sin(0.15 * t)
     zero, one = jnp.zeros_like(t), jnp.ones_like(t)
@@ -52,7 +52,7 @@ def photograph(T_world_cam):
 
 def pose_errors(pose_fn):
     """Largest errors over the photographs [m, degrees]."""
-    T, T_true = (np.asarray(jax.vmap(f)(TIMES), np.float64) for f in (pose_fn, truth))
+    T, T_true = (np.asarray(jax.vmap(f)(TIMES), np.float64) for f in (pose_fn, ground_truth))
     turn = Rotation.from_matrix(T[:, :3, :3].transpose(0, 2, 1) @ T_true[:, :3, :3])
     return np.linalg.norm((T - T_true)[:, :3, 3], axis=1).max(), np.degrees(turn.magnitude()).max()
 
@@ -60,9 +60,9 @@ def pose_errors(pose_fn):
 def test_a_trajectory_is_found_through_their_scene_and_gyroscope():
     config = PoseNetConfig(span=(0.0, 1.0), octaves=1, layers=3, width=32, activation="softplus", gain=2.0)
     field = posenet(config)
-    photographs = jax.jit(jax.vmap(lambda t: photograph(truth(t))))(TIMES)
+    photographs = jax.jit(jax.vmap(lambda t: photograph(ground_truth(t))))(TIMES)
     gyro_times = jnp.linspace(0.0, 1.0, 20)
-    omega_body = jax.vmap(lambda t: motion(truth, t).omega_body)(gyro_times)
+    omega_body = jax.vmap(lambda t: motion(ground_truth, t).omega_body)(gyro_times)
     adam = optax.adam(optax.exponential_decay(3e-3, 1000, 0.01))
 
     def loss_fn(params):

@@ -124,8 +124,8 @@ def test_a_signed_distance_is_rendered_without_bias(dtype):
         depths = jnp.asarray(np.arange(1.5, 2.5, WIDTH / 2) + offset, dtype)
         T = camera_pose(dtype)
         direction = jnp.asarray([0.2, 0.1, 1.0], dtype)
-        truth = wall_depth(np.asarray(T, np.float64), np.asarray(direction, np.float64))
-        errors.append(float(render(T, direction, depths)) - truth)
+        ground_truth = wall_depth(np.asarray(T, np.float64), np.asarray(direction, np.float64))
+        errors.append(float(render(T, direction, depths)) - ground_truth)
     assert np.abs(np.mean(errors)) < 2e-4
     assert np.abs(errors).max() < 5e-4
 

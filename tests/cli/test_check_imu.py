@@ -1,4 +1,4 @@
-"""`jaxpose check` on readings and truth: faults put into some that are right, each named."""
+"""`jaxpose check` on readings and ground truth: faults put into some that are right, each named."""
 
 from typing import Any
 
@@ -24,7 +24,7 @@ def acceleration(t):
 
 
 def euroc(folder, *, change=lambda T: T, gyro=1.0, force=1.0, late_s=0.0, roll=0, mounting=None, ns=10**9):
-    """An ASL folder of 30 s: readings at 100 Hz, truth at 50 Hz, faults as they are asked for."""
+    """An ASL folder of 30 s: readings at 100 Hz, ground truth at 50 Hz, faults as they are asked for."""
     t, h = np.arange(0, 30, 0.01), 1e-4
     omega = (turning(t - h).inv() * turning(t + h)).as_rotvec() / (2 * h) + [0.01, -0.02, 0.05]
     up = acceleration(t) + [0, 0, 9.81]
@@ -50,8 +50,11 @@ def euroc(folder, *, change=lambda T: T, gyro=1.0, force=1.0, late_s=0.0, roll=0
 
 def write_csv(file, t, rows, ns):
     file.parent.mkdir(parents=True)
-    stamps = [(T0_NS + round(s * 1e9)) // (10**9 // ns) for s in t]
-    lines = [",".join(map(str, [stamp, *row])) for stamp, row in zip(stamps, rows.tolist(), strict=True)]
+    timestamps = [(T0_NS + round(s * 1e9)) // (10**9 // ns) for s in t]
+    lines = [
+        ",".join(map(str, [timestamp, *row]))
+        for timestamp, row in zip(timestamps, rows.tolist(), strict=True)
+    ]
     file.write_text("#timestamp [ns],...\n" + "\n".join(lines) + "\n")
 
 
@@ -105,7 +108,7 @@ def test_without_truth_the_readings_are_still_checked(tmp_path):
     folder = euroc(tmp_path) / "mav0"
     (folder / "state_groundtruth_estimate0/data.csv").unlink()
     result = checked(tmp_path)
-    assert faults(result) == "" and any("no truth to compare" in note for note in result.notes)
+    assert faults(result) == "" and any("no ground truth to compare" in note for note in result.notes)
     (folder / "imu0/data.csv").unlink()
     (folder / "imu0/sensor.yaml").unlink()
     assert exit_code(checked(tmp_path)) == 1

@@ -67,15 +67,17 @@ def plain(folder, clip, save, *, change=lambda T: T, per_metre=1000.0, seconds=1
 
 
 def tum(folder, clip, save, *, per_metre=5000.0, order=(0, 1, 2, 3), seconds=1.0):
-    """A folder of TUM's layout, `order` of the quaternion's columns, stamps in units of `seconds`."""
+    """A folder of TUM's layout, `order` of the quaternion's columns, timestamps in units of `seconds`."""
     write_images(folder, clip, save, per_metre)
-    stamps = [f"{(T0 + t) / seconds:.6f}" if seconds == 1 else f"{T0_NS + round(t * 1e9)}" for t in clip.t]
+    timestamps = [
+        f"{(T0 + t) / seconds:.6f}" if seconds == 1 else f"{T0_NS + round(t * 1e9)}" for t in clip.t
+    ]
     for kind, name in (("color", "rgb"), ("depth", "depth")):
-        lines = [f"{stamp} {kind}/{i}.png" for i, stamp in enumerate(stamps)]
+        lines = [f"{timestamp} {kind}/{i}.png" for i, timestamp in enumerate(timestamps)]
         (folder / f"{name}.txt").write_text("\n".join(lines) + "\n")
     quaternions = Rotation.from_matrix(clip.T_world_cam[:, :3, :3]).as_quat()[:, list(order)]
     rows = np.column_stack([clip.T_world_cam[:, :3, 3], quaternions])
-    lines = [" ".join([stamp, *map(str, row)]) for stamp, row in zip(stamps, rows, strict=True)]
+    lines = [" ".join([timestamp, *map(str, row)]) for timestamp, row in zip(timestamps, rows, strict=True)]
     (folder / "groundtruth.txt").write_text("\n".join(lines) + "\n")
     return folder
 
@@ -85,7 +87,10 @@ def test_a_good_recording_has_no_fault(tmp_path, clip, save):
     assert result.format == "RGB-D recording (plain)" and faults(result) == "" and exit_code(result) == 0
     numbers = {fact.name: fact.numbers for fact in result.facts}
     assert numbers["frames"]["count"] == 21 and numbers["frames"]["rate_hz"] == pytest.approx(4)
-    assert numbers["times.txt"]["first_stamp_s"] == pytest.approx(T0) and numbers["truth"]["coverage"] == 1
+    assert (
+        numbers["times.txt"]["first_stamp_s"] == pytest.approx(T0)
+        and numbers["ground_truth"]["coverage"] == 1
+    )
     assert numbers["camera"]["fov_x_deg"] == pytest.approx(np.degrees(2 * np.arctan(40 / 73)))
     assert numbers["depth"]["coverage"] == 1
     assert numbers["depth"]["median_m"] == pytest.approx(np.median(clip.depth[::5]), rel=0.01)
@@ -133,7 +138,7 @@ def test_tum_in_its_own_conventions_and_in_others(tmp_path, clip, save):
     result = checked(tum(tmp_path / "order", clip, save, order=(3, 0, 1, 2)))
     assert "quaternions in the order wxyz, read as xyzw" in faults(result)
     result = checked(tum(tmp_path / "ns", clip, save, seconds=1e-9))
-    assert set(named_tests(result)) == {"unit of time"} and "convert the stamps from ns to s" in faults(
+    assert set(named_tests(result)) == {"unit of time"} and "convert the timestamps from ns to s" in faults(
         result
     )
 

@@ -30,28 +30,28 @@ def paths(count=60, seed=0):
     rng = np.random.default_rng(seed)
     t = 1.6e9 + np.linspace(0, 3, count)
     s = t - t[0]
-    truth = np.tile(np.eye(4), (count, 1, 1))
-    truth[:, :3, :3] = Rotation.from_rotvec(np.stack([s, 0.5 * np.sin(s), 0.2 * s], -1)).as_matrix()
-    truth[:, :3, 3] = np.stack([2 * np.sin(s), np.cos(2 * s), 0.3 * s], -1)
-    estimate = truth.copy()
+    ground_truth = np.tile(np.eye(4), (count, 1, 1))
+    ground_truth[:, :3, :3] = Rotation.from_rotvec(np.stack([s, 0.5 * np.sin(s), 0.2 * s], -1)).as_matrix()
+    ground_truth[:, :3, 3] = np.stack([2 * np.sin(s), np.cos(2 * s), 0.3 * s], -1)
+    estimate = ground_truth.copy()
     turned = Rotation.from_rotvec(0.03 * rng.normal(size=(count, 3))).as_matrix()
-    estimate[:, :3, :3] = truth[:, :3, :3] @ turned
+    estimate[:, :3, :3] = ground_truth[:, :3, :3] @ turned
     estimate[:, :3, 3] += 0.02 * rng.normal(size=(count, 3)) + 0.02 * s[:, None]
     estimate = trajectory_error.align(rigid.Similarity(0.7, turned[0], np.array([3.0, 1, 2])), estimate)
     late = rng.uniform(-0.008, 0.008, count)
-    return trajectories.Trajectory(t, truth), trajectories.Trajectory(t + late, estimate)
+    return trajectories.Trajectory(t, ground_truth), trajectories.Trajectory(t + late, estimate)
 
 
 @pytest.fixture
 def files(tmp_path):
-    """Truth, and an estimate that lacks some poses and has others of times long after."""
-    truth, estimate = paths()
+    """Ground truth, and an estimate that lacks some poses and has others of times long after."""
+    ground_truth, estimate = paths()
     kept = np.setdiff1d(np.arange(60), [5, 6, 30])
     t = np.append(estimate.t[kept], estimate.t[-1] + [5, 6])
     T = np.concatenate([estimate.T[kept], estimate.T[:2]])
-    trajectories.write_tum(tmp_path / "truth.txt", truth)
+    trajectories.write_tum(tmp_path / "ground truth.txt", ground_truth)
     trajectories.write_tum(tmp_path / "estimate.txt", trajectories.Trajectory(t, T))
-    return tmp_path / "estimate.txt", tmp_path / "truth.txt"
+    return tmp_path / "estimate.txt", tmp_path / "ground truth.txt"
 
 
 def assert_agrees_with_evo(estimate, reference, align, most):
@@ -64,11 +64,11 @@ def assert_agrees_with_evo(estimate, reference, align, most):
         estimate, reference, align=align, max_difference=most, rpe_frames=(1, 10), rpe_metres=(0.5,)
     )
     ours = evaluate.run(config)
-    truth, found = (file_interface.read_tum_trajectory_file(file) for file in (reference, estimate))
-    truth, found = sync.associate_trajectories(truth, found, max_diff=most)
+    ground_truth, found = (file_interface.read_tum_trajectory_file(file) for file in (reference, estimate))
+    ground_truth, found = sync.associate_trajectories(ground_truth, found, max_diff=most)
     found = copy.deepcopy(found)
     if align != "none":
-        found.align(truth, correct_scale=align == "sim3")
+        found.align(ground_truth, correct_scale=align == "sim3")
     parts = {"m": PoseRelation.translation_part, "deg": PoseRelation.rotation_angle_deg}
     pairs = [(ours.ate_m, APE(parts["m"])), (ours.rotation_deg, APE(parts["deg"]))]
     units = {"frames": Unit.frames, "m": Unit.meters}
@@ -81,9 +81,9 @@ def assert_agrees_with_evo(estimate, reference, align, most):
                         RPE(parts[part], rpe.delta, units[rpe.unit], 0.1, True, pairs_from_reference=True),
                     )
                 )
-    assert len(pairs) == 8 and ours.pairs == truth.num_poses
+    assert len(pairs) == 8 and ours.pairs == ground_truth.num_poses
     for statistics, metric in pairs:
-        metric.process_data((truth, found))
+        metric.process_data((ground_truth, found))
         for name in trajectory_error.Statistics._fields:
             theirs = metric.get_statistic(StatisticsType[name])
             assert getattr(statistics, name) == pytest.approx(theirs, abs=1e-6), (metric, name)
@@ -115,42 +115,42 @@ def test_numbers_on_real_trajectories_are_evos(data_dir, estimate, reference, pa
 
 def test_rpe_over_seconds_is_that_over_as_many_frames(files):
     """At a steady rate, with a delta of which a tenth is less than a frame."""
-    truth, estimate = paths(61)
-    for file, trajectory in zip(files, (estimate, truth), strict=True):
-        trajectories.write_tum(file, trajectories.Trajectory(truth.t, trajectory.T))
+    ground_truth, estimate = paths(61)
+    for file, trajectory in zip(files, (estimate, ground_truth), strict=True):
+        trajectories.write_tum(file, trajectories.Trajectory(ground_truth.t, trajectory.T))
     by_frames, by_time = evaluate.run(Config(*files, rpe_frames=(5,), rpe_seconds=(0.25,))).rpe
     np.testing.assert_allclose(by_time.translation_m, by_frames.translation_m, atol=1e-12)
     assert (by_time.unit, by_time.delta, by_time.pairs) == ("s", 0.25, by_frames.pairs)
 
 
 def test_formats_do_not_change_the_numbers(files, tmp_path):
-    truth, estimate = paths()
-    expected = trajectory_error.ate(estimate.T, truth.T).rmse
-    trajectories.write_euroc(tmp_path / "truth.csv", truth)
+    ground_truth, estimate = paths()
+    expected = trajectory_error.ate(estimate.T, ground_truth.T).rmse
+    trajectories.write_euroc(tmp_path / "ground truth.csv", ground_truth)
     trajectories.write_euroc(tmp_path / "estimate.csv", estimate)
     trajectories.write_kitti(tmp_path / "kitti.txt", estimate.T)
-    np.savetxt(tmp_path / "list.txt", truth.T.reshape(-1, 4), fmt="%.17g")
+    np.savetxt(tmp_path / "list.txt", ground_truth.T.reshape(-1, 4), fmt="%.17g")
     for pair, how, said in (
-        (("estimate.csv", "truth.csv"), "nearest stamps, at most 0.01 s apart", "EuRoC file"),
-        (("kitti.txt", "truth.txt"), "row by row, as not both have stamps", "KITTI file"),
-        (("kitti.txt", "list.txt"), "row by row, as not both have stamps", "no stamps"),
+        (("estimate.csv", "ground truth.csv"), "nearest timestamps, at most 0.01 s apart", "EuRoC file"),
+        (("kitti.txt", "ground truth.txt"), "row by row, as not both have timestamps", "KITTI file"),
+        (("kitti.txt", "list.txt"), "row by row, as not both have timestamps", "no timestamps"),
     ):
         result = evaluate.run(Config(*(tmp_path / name for name in pair)))
         assert result.ate_m.rmse == pytest.approx(expected, abs=1e-9)
         text = evaluate.report(result)
         assert how in text and said in text and "SE(3)" in text
-    assert result.notes == ("no stamps, so no RPE over seconds",)
+    assert result.notes == ("no timestamps, so no RPE over seconds",)
     assert [rpe.unit for rpe in result.rpe] == ["frames"]
 
 
 def test_clocks_that_differ(files):
     estimate = trajectories.read_tum(files[0])
     trajectories.write_tum(files[0], estimate._replace(t=estimate.t - 1.6e9))
-    with pytest.raises(DataError, match="expected stamps within 0.01 s"):
+    with pytest.raises(DataError, match="expected timestamps within 0.01 s"):
         evaluate.run(Config(*files))
     found = evaluate.run(Config(*files, time_offset=1.6e9))
     trajectories.write_tum(files[0], estimate)
-    # Stamps since 1970 are rounded to 0.24 us, and at most that can pair others.
+    # Timestamps since 1970 are rounded to 0.24 us, and at most that can pair others.
     assert found.ate_m == pytest.approx(evaluate.run(Config(*files)).ate_m)
     assert "the estimate's moved by 1.6e+09 s" in found.association
 
@@ -178,18 +178,19 @@ def test_a_run_is_asked_at_the_references_own_stamps(run_folder, tmp_path):
     """Exact where the nearest frame is as far off as the camera moves in that time."""
     t = np.sort(np.random.default_rng(1).uniform(-0.2, 3.1, 100))
     trajectories.write_tum(
-        tmp_path / "truth.txt", trajectories.Trajectory(t, numpy_evaluator.load(run_folder / "field.npz")(t))
+        tmp_path / "ground truth.txt",
+        trajectories.Trajectory(t, numpy_evaluator.load(run_folder / "field.npz")(t)),
     )
-    config = Config(run_folder, tmp_path / "truth.txt", align="none", max_difference=0.05)
+    config = Config(run_folder, tmp_path / "ground truth.txt", align="none", max_difference=0.05)
     exact = evaluate.run(config)
     inside = int(((t >= 0) & (t <= 3)).sum())
     assert exact.pairs == inside < 100
     assert exact.ate_m.max < 1e-9 and exact.rotation_deg.max < 1e-5
-    assert "exact: the continuous trajectory (field.npz) at the reference's stamps" in exact.association
-    assert f"; {100 - inside} stamps of the reference beyond its ends are left out" in exact.association
+    assert "exact: the continuous trajectory (field.npz) at the reference's timestamps" in exact.association
+    assert f"; {100 - inside} timestamps of the reference beyond its ends are left out" in exact.association
     assert "rgbd_slam run, 31 poses" in exact.estimate
     nearest = evaluate.run(replace(config, match="nearest"))
-    assert nearest.ate_m.max > 1e-3 and "nearest stamps, at most 0.05 s" in nearest.association
+    assert nearest.ate_m.max > 1e-3 and "nearest timestamps, at most 0.05 s" in nearest.association
     (run_folder / "field.npz").unlink()
     assert evaluate.run(config).ate_m == nearest.ate_m
     with pytest.raises(
@@ -223,7 +224,7 @@ def test_the_table(files, capsys, tmp_path):
     assert [float(cell) for cell in cells[3:7]] == pytest.approx(expected, abs=1e-6) and cells[
         2
     ].strip() == "m"
-    assert "57 of 59 poses of the shorter one: nearest stamps" in text and "TUM file, 59 poses" in text
+    assert "57 of 59 poses of the shorter one: nearest timestamps" in text and "TUM file, 59 poses" in text
     assert "SE(3)" in text and "RPE over 0.5 m" in text and "RPE over 1 frame " in text
     assert "RPE over 100 m: no two poses are that far apart, to a tenth" in text and str(plot) in text
     with Image.open(plot) as image:
@@ -235,7 +236,7 @@ complaint = partial(refused.complaint, main_command.main)
 
 
 def test_wrong_calls_cost_one_line(files, tmp_path):
-    estimate, truth = files
+    estimate, file = files
     (tmp_path / "folder" / "none").mkdir(parents=True)
     trajectories.write_tum(tmp_path / "folder" / "none" / "trajectory.txt", paths()[0])
     trajectories.write_kitti(tmp_path / "kitti.txt", paths(10)[0].T)
@@ -245,18 +246,18 @@ def test_wrong_calls_cost_one_line(files, tmp_path):
     for args, message in (
         ([], "jaxpose: Expected one of .*eval, export"),
         (["evaluate"], "eval"),
-        (["eval", truth], "Missing from jaxpose eval: REFERENCE"),
-        (["eval", truth, truth, "--aling", "se3"], "--align"),
-        (["eval", truth, truth, "--align", "affine"], "expected one of"),
-        (["eval", truth, truth, "--max-difference", "-1"], "--max-difference: expected 0 or more, got -1.0"),
-        (["eval", truth, truth, "--rpe-metres", "0"], "--rpe-metres: expected positive numbers, got 0.0"),
-        (["eval", truth, tmp_path / "x"], "x: expected a trajectory file or a run folder, got nothing"),
-        (["eval", tmp_path / "folder", truth], "with trajectory.txt, got runs in it: none"),
-        (["eval", tmp_path / "kitti.txt", truth], "kitti.txt: expected 60 poses, as .*, got 10"),
-        (["eval", truth, truth, "--match", "exact"], "expected a run folder with field.npz, got a TUM file"),
-        (["eval", truth, truth, "--plot", tmp_path / "no" / "p.png"], "No such file or directory"),
-        (["eval", truth, truth, "--plot", "p.jpg"], "--plot: expected a name that ends in .png, got p.jpg"),
-        (["eval", tmp_path / "broken", truth], "broken/results.json: expected the results of a run"),
+        (["eval", file], "Missing from jaxpose eval: REFERENCE"),
+        (["eval", file, file, "--aling", "se3"], "--align"),
+        (["eval", file, file, "--align", "affine"], "expected one of"),
+        (["eval", file, file, "--max-difference", "-1"], "--max-difference: expected 0 or more, got -1.0"),
+        (["eval", file, file, "--rpe-metres", "0"], "--rpe-metres: expected positive numbers, got 0.0"),
+        (["eval", file, tmp_path / "x"], "x: expected a trajectory file or a run folder, got nothing"),
+        (["eval", tmp_path / "folder", file], "with trajectory.txt, got runs in it: none"),
+        (["eval", tmp_path / "kitti.txt", file], "kitti.txt: expected 60 poses, as .*, got 10"),
+        (["eval", file, file, "--match", "exact"], "expected a run folder with field.npz, got a TUM file"),
+        (["eval", file, file, "--plot", tmp_path / "no" / "p.png"], "No such file or directory"),
+        (["eval", file, file, "--plot", "p.jpg"], "--plot: expected a name that ends in .png, got p.jpg"),
+        (["eval", tmp_path / "broken", file], "broken/results.json: expected the results of a run"),
     ):  # fmt: skip
         line = complaint(*args)
         assert line.startswith("jaxpose") and re.search(message, line, re.IGNORECASE), line

@@ -73,7 +73,7 @@ def test_poses_come_back_from_trajectory_files(run, tmp_path, format, stamped):
     if stamped:
         np.testing.assert_allclose(read.trajectory.t, written.t, rtol=0, atol=1e-9)
     else:
-        assert "no stamps" in " ".join(result.notes)
+        assert "no timestamps" in " ".join(result.notes)
 
 
 def test_poses_come_back_from_transforms(run, tmp_path):
@@ -119,15 +119,15 @@ def test_other_times(run, tmp_path):
     np.testing.assert_allclose(read.t, np.arange(121) / 40)
     np.testing.assert_allclose(read.T, field(read.t), atol=1e-12)
     assert result.times == "of the continuous trajectory at 40 Hz"
-    (tmp_path / "stamps.csv").write_text("#ns\n" + "".join(f"{s}\n" for s in (-0.5, 0.25, 1.5, 3.0, 3.1)))
-    result = exported(run, "euroc", out, at=tmp_path / "stamps.csv")
+    (tmp_path / "timestamps.csv").write_text("#ns\n" + "".join(f"{s}\n" for s in (-0.5, 0.25, 1.5, 3.0, 3.1)))
+    result = exported(run, "euroc", out, at=tmp_path / "timestamps.csv")
     read = trajectories.read_euroc(out)
     np.testing.assert_allclose(read.t, [0.25, 1.5, 3.0])
     np.testing.assert_allclose(read.T, field(read.t), atol=1e-12)
-    assert result.notes == ("2 of 5 stamps are beyond the ends of the run: left out",)
-    (tmp_path / "stamps.csv").write_text("7\n8\n")
-    with pytest.raises(DataError, match="expected stamps from 0.000 to 3.000 s, as the run has, got 7"):
-        export.run(Config(run, format="tum", out=out, at=tmp_path / "stamps.csv"))
+    assert result.notes == ("2 of 5 timestamps are beyond the ends of the run: left out",)
+    (tmp_path / "timestamps.csv").write_text("7\n8\n")
+    with pytest.raises(DataError, match="expected timestamps from 0.000 to 3.000 s, as the run has, got 7"):
+        export.run(Config(run, format="tum", out=out, at=tmp_path / "timestamps.csv"))
 
 
 def test_a_trajectory_file_has_its_own_stamps_only(run, tmp_path):
@@ -143,7 +143,7 @@ def test_a_trajectory_file_has_its_own_stamps_only(run, tmp_path):
     for options, message in (
         (
             {"at": tmp_path / "between.txt"},
-            "between.txt: expected stamps of .*, as its motion between",
+            "between.txt: expected timestamps of .*, as its motion between",
         ),
         ({"rate_hz": 5.0}, "trajectory.txt: expected a run folder with field.npz, got a TUM file"),
     ):
@@ -153,7 +153,7 @@ def test_a_trajectory_file_has_its_own_stamps_only(run, tmp_path):
         with pytest.raises(DataError, match="trajectory.txt: expected a run folder"):
             export.run(Config(file, format=format, out=out))
     trajectories.write_kitti(tmp_path / "kitti", written.T)
-    with pytest.raises(DataError, match="kitti: expected stamps for --format tum, got a KITTI file"):
+    with pytest.raises(DataError, match="kitti: expected timestamps for --format tum, got a KITTI file"):
         export.run(Config(tmp_path / "kitti", format="tum", out=out))
     assert not out.exists()
 

@@ -50,11 +50,14 @@ def poses(t):
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
-    """A TUM file at 50 Hz and an EuRoC folder at 200 Hz, which begins a second later; stamps since 1970."""
+    """A TUM file at 50 Hz and an EuRoC folder at 200 Hz, which begins a second later.
+
+    Timestamps since 1970.
+    """
     folder = tmp_path_factory.mktemp("fit")
     t0 = 1_403_715_524.0
     t = np.arange(0, SPAN, 0.02)
-    trajectories.write_tum(folder / "truth.txt", trajectories.Trajectory(t0 + t, poses(t)))
+    trajectories.write_tum(folder / "ground truth.txt", trajectories.Trajectory(t0 + t, poses(t)))
     rng = np.random.default_rng(0)
     t = np.arange(1, SPAN + 1, 0.005)
     sigmas = [density * np.sqrt(200) for density in DENSITIES]
@@ -64,10 +67,10 @@ def recording(tmp_path_factory):
     force += sigmas[1] * rng.normal(size=(len(t), 3))
     imu = folder / "mav0" / "imu0"
     imu.mkdir(parents=True)
-    stamps = [int(t0) * 10**9 + round(s * 1e9) for s in t]
+    timestamps = [int(t0) * 10**9 + round(s * 1e9) for s in t]
     rows = [
-        ",".join([str(stamp), *map(repr, (*w.tolist(), *a.tolist()))])
-        for stamp, w, a in zip(stamps, gyro, force, strict=True)
+        ",".join([str(timestamp), *map(repr, (*w.tolist(), *a.tolist()))])
+        for timestamp, w, a in zip(timestamps, gyro, force, strict=True)
     ]
     (imu / "data.csv").write_text("#timestamp [ns],w,a\n" + "\n".join(rows) + "\n")
     (imu / "sensor.yaml").write_text(
@@ -79,7 +82,9 @@ def recording(tmp_path_factory):
 
 
 def small(folder, **changes):
-    config = Config(folder / "truth.txt", posenet_octaves=(2,), posenet_layers=3, posenet_width=32, steps=300)
+    config = Config(
+        folder / "ground truth.txt", posenet_octaves=(2,), posenet_layers=3, posenet_width=32, steps=300
+    )
     return replace(config, bspline_hz=(1.0, 10.0), **changes)
 
 
@@ -135,7 +140,7 @@ def test_the_report_and_its_json(result, recording, capsys):
     assert "| B-spline 10 knots/s |" in text and re.search(r"best +\|", text) and "too slow" in text
     assert "95% of the power" in text and "every tenth" in text and "biases and gravity fitted" in text
     tiny = ["--posenet-octaves", "0", "--posenet-layers", "1", "--bspline-hz", "--steps", "9"]
-    main_command.main(["fit", str(recording / "truth.txt"), *tiny, "--json"])
+    main_command.main(["fit", str(recording / "ground truth.txt"), *tiny, "--json"])
     said = json.loads(capsys.readouterr().out)
     assert said["best"] == "PoseNet F=0 1x256" and said["fields"][0]["rotation_deg"]["median"] > 0
 
@@ -171,17 +176,17 @@ def test_real_motion_is_carried_to_millimetres(data_dir):
         (["nowhere.txt"], r"nowhere.txt: expected a trajectory file or a run folder, got nothing"),
         (["short.txt"], r"short.txt.*expected at least 20 poses to fit, got 5"),
         (["kitti.txt"], r"kitti.txt: expected --rate-hz"),
-        (["truth.txt", "--rate-hz", "5"], r"truth.txt: expected no --rate-hz"),
-        (["truth.txt", "--imu", "nowhere"], r"nowhere: expected a folder in the EuRoC"),
-        (["truth.txt", "--bspline-hz", "-1"], r"--bspline-hz: expected positive numbers, got -1"),
-        (["truth.txt", "--posenet-octaves", "--bspline-hz"], r"--bspline-hz: expected a field to fit"),
-        (["truth.txt", "--imu", "late"], r"late: expected an IMU on the clock of the poses"),
+        (["ground truth.txt", "--rate-hz", "5"], r"ground truth.txt: expected no --rate-hz"),
+        (["ground truth.txt", "--imu", "nowhere"], r"nowhere: expected a folder in the EuRoC"),
+        (["ground truth.txt", "--bspline-hz", "-1"], r"--bspline-hz: expected positive numbers, got -1"),
+        (["ground truth.txt", "--posenet-octaves", "--bspline-hz"], r"--bspline-hz: expected a field to fit"),
+        (["ground truth.txt", "--imu", "late"], r"late: expected an IMU on the clock of the poses"),
     ],
 )
 def test_bad_calls_are_one_line(args, expected, tmp_path, recording, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     t = np.arange(0, 4, 0.1)
-    trajectories.write_tum("truth.txt", trajectories.Trajectory(t, poses(t)))
+    trajectories.write_tum("ground truth.txt", trajectories.Trajectory(t, poses(t)))
     trajectories.write_tum("short.txt", trajectories.Trajectory(t[:5], poses(t[:5])))
     trajectories.write_kitti("kitti.txt", poses(t))
     (tmp_path / "late").symlink_to(recording)

@@ -33,7 +33,7 @@ from jaxpose.geometry.camera import Camera
 from jaxpose.scenes import GridConfig
 from jaxpose.slam.map.texture import Paint
 
-COUNT, LAST, FIRST, SPEED = 9, 2.0, 5.0, 0.3  # frames, span [s], first stamp [s], along x [m/s]
+COUNT, LAST, FIRST, SPEED = 9, 2.0, 5.0, 0.3  # frames, span [s], first timestamp [s], along x [m/s]
 CAMERA = Camera(100.0, 100.0, 79.5, 59.5, 160, 120)
 WALL = 1.5  # [m] along z; red where x < 0.1, blue beyond
 RED, BLUE = (255, 0, 0), (0, 0, 255)
@@ -47,7 +47,7 @@ def poses_at(t):
 
 @pytest.fixture
 def run(tmp_path):
-    """What a SLAM run leaves: a camera that slides along a wall of two colours, stamps from 5 s on."""
+    """What a SLAM run leaves: a camera that slides along a wall of two colours, timestamps from 5 s on."""
     folder = tmp_path / "run"
     folder.mkdir()
     span, intervals = (FIRST, FIRST + LAST), 4
@@ -58,9 +58,9 @@ def run(tmp_path):
     )
     t = np.linspace(0, LAST, COUNT)
     trajectories.write_tum(folder / "trajectory.txt", trajectories.Trajectory(FIRST + t, poses_at(t)))
-    truth = poses_at(t)
-    truth[:, 1, 3] = 0.01
-    trajectories.write_tum(folder / "reference.txt", trajectories.Trajectory(FIRST + t, truth))
+    ground_truth = poses_at(t)
+    ground_truth[:, 1, 3] = 0.01
+    trajectories.write_tum(folder / "reference.txt", trajectories.Trajectory(FIRST + t, ground_truth))
     names = tuple(f"{k}.png" for k in range(COUNT))
     for k, name in enumerate(names):
         Image.new("RGB", (320, 240), (k, 0, 0)).save(folder / name)
@@ -192,7 +192,7 @@ def test_a_saved_page_plays_the_way_of_the_camera(run, tmp_path, capsys):
         for _, message in messages
         if message["type"].endswith("Message") and "name" in message
     }
-    assert {"/estimate", "/truth", "/keyframes", "/camera", "/map"} <= made
+    assert {"/estimate", "/ground truth", "/keyframes", "/camera", "/map"} <= made
     assert sum(name.startswith("/frames/") for name in made) == 4
     told = [(t, message) for t, message in messages if message.get("name") == "/camera"]
     way = np.array([(t, *message["position"]) for t, message in told if "position" in message])

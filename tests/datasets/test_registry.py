@@ -32,7 +32,7 @@ def touch(folder, files):
 def test_formats_are_told_apart_and_their_loader_is_asked(tmp_path, name):
     touch(tmp_path, LAYOUTS[name])
     assert rgbd_registry.find_format(tmp_path) == rgbd_registry.find_format(str(tmp_path)) == name
-    with pytest.raises(DataError, match=r"expected (an image|lines of a stamp)"):
+    with pytest.raises(DataError, match=r"expected (an image|lines of a timestamp)"):
         rgbd_registry.load(tmp_path)
 
 
@@ -107,12 +107,14 @@ def test_the_commands_find_the_format(desk):
 
 
 def test_the_commands_take_the_recording_s_own_imu(desk, walk, save):
-    stamp = lambda k: 1403715273262142976 + 50_000_000 * k
+    timestamp = lambda k: 1403715273262142976 + 50_000_000 * k
     mav0 = desk.parent / "V1_01_easy" / "mav0"
     for kind, pixels in (("cam0", walk.rgb), ("depth0", walk.counts)):
         for k in range(6):
-            save(mav0 / kind / f"data/{stamp(k)}.png", pixels[k])
-        (mav0 / kind / "data.csv").write_text("".join(f"{stamp(k)},{stamp(k)}.png\n" for k in range(6)))
+            save(mav0 / kind / f"data/{timestamp(k)}.png", pixels[k])
+        (mav0 / kind / "data.csv").write_text(
+            "".join(f"{timestamp(k)},{timestamp(k)}.png\n" for k in range(6))
+        )
     pose = "T_BS:\n  data: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]\n"
     (mav0 / "cam0/sensor.yaml").write_text(
         f"{pose}resolution: [32, 24]\nintrinsics: [30, 31, 15, 11]\n"
@@ -123,7 +125,7 @@ def test_the_commands_take_the_recording_s_own_imu(desk, walk, save):
         f"{pose}gyroscope_noise_density: 1e-4\ngyroscope_random_walk: 1e-5\n"
         "accelerometer_noise_density: 2e-3\naccelerometer_random_walk: 3e-3\n"
     )
-    lines = [f"{stamp(0) + 5_000_000 * k},{k},0,0,0,0,9.8\n" for k in range(60)]
+    lines = [f"{timestamp(0) + 5_000_000 * k},{k},0,0,0,0,9.8\n" for k in range(60)]
     (mav0 / "imu0/data.csv").write_text("".join(lines))
     with pytest.raises(
         DataError, match="V1_01_easy: --imu combined expected readings around frame 1, which has"
@@ -131,7 +133,7 @@ def test_the_commands_take_the_recording_s_own_imu(desk, walk, save):
         load(imu_slam.Config(data=mav0.parent, start=1))
     assert load(rgbd_slam.Config(data=mav0.parent, start=1)).recording.T_world_cam is None
     (mav0 / "state_groundtruth_estimate0").mkdir()
-    lines = [f"{stamp(0) + 5_000_000 * k},1,2,3,1,0,0,0,{','.join('0' * 9)}\n" for k in range(60)]
+    lines = [f"{timestamp(0) + 5_000_000 * k},1,2,3,1,0,0,0,{','.join('0' * 9)}\n" for k in range(60)]
     (mav0 / "state_groundtruth_estimate0/data.csv").write_text("".join(lines))
     source = load(imu_slam.Config(data=mav0.parent, start=1))
     assert source.about["format"] == "euroc"

@@ -42,11 +42,11 @@ def barf(estimate, reference):
     assert np.linalg.det(R) > 0
     centres = (X1 - t1) / s1 @ R.T * s0 + t0
     aligned = np.linalg.inv(estimate)[:, :3, :3] @ R.T
-    truth = np.linalg.inv(reference)
+    ground_truth = np.linalg.inv(reference)
     vectors = -np.einsum("nij,nj->ni", aligned, centres)
-    cosine = (np.trace(aligned @ truth[:, :3, :3].swapaxes(1, 2), axis1=1, axis2=2) - 1) / 2
+    cosine = (np.trace(aligned @ ground_truth[:, :3, :3].swapaxes(1, 2), axis1=1, axis2=2) - 1) / 2
     angles = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
-    return angles.mean(), np.linalg.norm(vectors - truth[:, :3, 3], axis=1).mean()
+    return angles.mean(), np.linalg.norm(vectors - ground_truth[:, :3, 3], axis=1).mean()
 
 
 @pytest.mark.parametrize("seed", range(5))

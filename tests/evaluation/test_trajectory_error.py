@@ -35,15 +35,15 @@ def random_similarity(rng, scale=None):
 
 @pytest.fixture(scope="module", params=PAIRS, ids=[estimate for _, estimate in PAIRS])
 def real(request, data_dir):
-    """Truth and estimate associated by evo, as its trajectories and as plain pose arrays."""
+    """Ground truth and estimate associated by evo, as its trajectories and as plain pose arrays."""
     from evo.core import sync
     from evo.tools import file_interface
 
-    truth, estimate = (
+    ground_truth, estimate = (
         file_interface.read_tum_trajectory_file(data_dir / "trajectories" / name) for name in request.param
     )
-    truth, estimate = sync.associate_trajectories(truth, estimate, max_diff=0.02)
-    return truth, estimate, np.array(truth.poses_se3), np.array(estimate.poses_se3)
+    ground_truth, estimate = sync.associate_trajectories(ground_truth, estimate, max_diff=0.02)
+    return ground_truth, estimate, np.array(ground_truth.poses_se3), np.array(estimate.poses_se3)
 
 
 def assert_same_statistics(ours, evo_metric):
@@ -60,21 +60,21 @@ def test_ate_agrees_with_evo(real, alignment):
 
     from evo.core.metrics import APE, PoseRelation
 
-    truth, estimate, T_truth, T_estimate = real
+    ground_truth, estimate, T_truth, T_estimate = real
     estimate = copy.deepcopy(estimate)
     ours = trajectory_error.ate(T_estimate, T_truth, alignment)
     if alignment != "none":
-        rotation, translation, scale = estimate.align(truth, correct_scale=alignment == "sim3")
+        rotation, translation, scale = estimate.align(ground_truth, correct_scale=alignment == "sim3")
         np.testing.assert_allclose(ours.alignment.rotation, rotation, atol=1e-6)
         np.testing.assert_allclose(ours.alignment.translation, translation, atol=1e-6)
         assert ours.alignment.scale == pytest.approx(scale, abs=1e-6)
     theirs = APE(PoseRelation.translation_part)
-    theirs.process_data((truth, estimate))
+    theirs.process_data((ground_truth, estimate))
     assert_same_statistics(ours, theirs)
     np.testing.assert_allclose(ours.errors, theirs.error, atol=1e-6)
     aligned = trajectory_error.align(ours.alignment, T_estimate)
     angles = APE(PoseRelation.rotation_angle_deg)
-    angles.process_data((truth, estimate))
+    angles.process_data((ground_truth, estimate))
     ours_deg = rigid.rotation_angle_deg(aligned[:, :3, :3], T_truth[:, :3, :3])
     np.testing.assert_allclose(ours_deg, angles.error, atol=1e-6)
 
@@ -87,17 +87,17 @@ def test_rpe_agrees_with_evo(real, delta, alignment):
 
     from evo.core.metrics import RPE, PoseRelation, Unit
 
-    truth, estimate, T_truth, T_estimate = real
+    ground_truth, estimate, T_truth, T_estimate = real
     estimate = copy.deepcopy(estimate)
     if alignment != "none":
-        estimate.align(truth, correct_scale=alignment == "sim3")
+        estimate.align(ground_truth, correct_scale=alignment == "sim3")
     ours = trajectory_error.rpe(T_estimate, T_truth, delta, alignment)
     for relation, statistics in (
         (PoseRelation.translation_part, ours.translation_m),
         (PoseRelation.rotation_angle_deg, ours.rotation_deg),
     ):
         theirs = RPE(relation, delta=delta, delta_unit=Unit.frames, all_pairs=True)
-        theirs.process_data((truth, estimate))
+        theirs.process_data((ground_truth, estimate))
         assert_same_statistics(statistics, theirs)
         assert ours.pairs == len(theirs.error)
 
@@ -110,10 +110,10 @@ def test_rpe_over_metres_agrees_with_evo(real, delta, alignment):
 
     from evo.core.metrics import RPE, PoseRelation, Unit
 
-    truth, estimate, T_truth, T_estimate = real
+    ground_truth, estimate, T_truth, T_estimate = real
     estimate = copy.deepcopy(estimate)
     if alignment != "none":
-        estimate.align(truth, correct_scale=True)
+        estimate.align(ground_truth, correct_scale=True)
     ours = trajectory_error.rpe(
         T_estimate, T_truth, delta, alignment, along=trajectory_error.path_length(T_truth)
     )
@@ -129,7 +129,7 @@ def test_rpe_over_metres_agrees_with_evo(real, delta, alignment):
             all_pairs=True,
             pairs_from_reference=True,
         )
-        theirs.process_data((truth, estimate))
+        theirs.process_data((ground_truth, estimate))
         assert_same_statistics(statistics, theirs)
         assert ours.pairs == len(theirs.error) > 100
 
@@ -141,14 +141,14 @@ def test_rpe_over_metres_agrees_with_evo(real, delta, alignment):
 @given(SEEDS, st.integers(3, 30))
 def test_umeyama_recovers_a_similarity(seed, count):
     rng = np.random.default_rng(seed)
-    truth, points = random_similarity(rng), rng.normal(size=(count, 3)) + 10
+    ground_truth, points = random_similarity(rng), rng.normal(size=(count, 3)) + 10
     found = trajectory_error.umeyama(
-        points, truth.scale * points @ truth.rotation.T + truth.translation, True
+        points, ground_truth.scale * points @ ground_truth.rotation.T + ground_truth.translation, True
     )
     # Three random points may lie nearly on a line, where the rotation is poorly determined.
     spread = np.linalg.svd(points - points.mean(0), compute_uv=False)[1]
-    for ours, theirs in zip(found, truth, strict=True):
-        np.testing.assert_allclose(ours, theirs, atol=1e-11 * truth.scale / min(spread, 1) ** 2)
+    for ours, theirs in zip(found, ground_truth, strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=1e-11 * ground_truth.scale / min(spread, 1) ** 2)
 
 
 @settings(deadline=None)
@@ -173,9 +173,9 @@ def test_rigid_alignment_agrees_with_scipy():
     rng = np.random.default_rng(0)
     points, target = rng.normal(size=(2, 20, 3))
     found = trajectory_error.umeyama(points, target, with_scale=False)
-    truth, _ = Rotation.align_vectors(target - target.mean(0), points - points.mean(0))
+    ground_truth, _ = Rotation.align_vectors(target - target.mean(0), points - points.mean(0))
     assert found.scale == 1
-    np.testing.assert_allclose(found.rotation, truth.as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(found.rotation, ground_truth.as_matrix(), atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -184,9 +184,9 @@ def test_rigid_alignment_agrees_with_scipy():
 )
 def test_ate_is_blind_to_exactly_its_alignment(alignment, moved_by, expected):
     rng = np.random.default_rng(1)
-    truth = random_poses(rng, 10)
+    ground_truth = random_poses(rng, 10)
     result = trajectory_error.ate(
-        trajectory_error.align(random_similarity(rng, moved_by), truth), truth, alignment
+        trajectory_error.align(random_similarity(rng, moved_by), ground_truth), ground_truth, alignment
     )
     assert result.rmse == pytest.approx(expected, abs=1e-12) if expected is not None else result.rmse > 0.1
 
@@ -207,10 +207,10 @@ def test_rpe_of_a_constant_drift(delta):
     step = np.eye(4)
     step[:3, :3] = Rotation.from_euler("z", 2, degrees=True).as_matrix()
     step[:3, 3] = [0, 0, 0.1]
-    truth = np.tile(np.eye(4), (9, 1, 1))
+    ground_truth = np.tile(np.eye(4), (9, 1, 1))
     estimate = np.array([np.linalg.matrix_power(step, i) for i in range(9)])
     world = trajectory_error.align(random_similarity(rng, 1.0), estimate)
-    result = trajectory_error.rpe(world, truth, delta)
+    result = trajectory_error.rpe(world, ground_truth, delta)
     assert result.translation_m.rmse == pytest.approx(0.1 * delta)
     assert result.rotation_deg.mean == pytest.approx(2 * delta)
     assert result.pairs == 9 - delta
@@ -249,14 +249,16 @@ def test_psnr():
 
 def test_poses_with_nan_are_left_out_and_counted():
     rng = np.random.default_rng(6)
-    truth = random_poses(rng, 12)
-    estimate = trajectory_error.align(random_similarity(rng), truth) + 0.01 * rng.normal(size=(12, 4, 4))
-    broken_truth, broken_estimate = truth.copy(), estimate.copy()
+    ground_truth = random_poses(rng, 12)
+    estimate = trajectory_error.align(random_similarity(rng), ground_truth) + 0.01 * rng.normal(
+        size=(12, 4, 4)
+    )
+    broken_truth, broken_estimate = ground_truth.copy(), estimate.copy()
     broken_truth[2, 0, 0], broken_estimate[7] = np.inf, np.nan
     kept = np.setdiff1d(np.arange(12), [2, 7])
     result, clean = (
         trajectory_error.ate(broken_estimate, broken_truth),
-        trajectory_error.ate(estimate[kept], truth[kept]),
+        trajectory_error.ate(estimate[kept], ground_truth[kept]),
     )
     assert (result.rmse, result.frames, result.skipped) == (clean.rmse, 10, 2)
     assert list(np.flatnonzero(np.isnan(result.errors))) == [2, 7]
@@ -270,10 +272,10 @@ def test_poses_with_nan_are_left_out_and_counted():
 def test_a_camera_on_a_line_is_aligned(alignment):
     """The error is well defined though the rotation about the line is not."""
     rng = np.random.default_rng(7)
-    truth = random_poses(rng, 10)
-    truth[:, :3, 3] = np.linspace(0, 1, 10)[:, None] * np.array([1.0, 2.0, -1.0]) + 5
+    ground_truth = random_poses(rng, 10)
+    ground_truth[:, :3, 3] = np.linspace(0, 1, 10)[:, None] * np.array([1.0, 2.0, -1.0]) + 5
     result = trajectory_error.ate(
-        trajectory_error.align(random_similarity(rng, 1.0), truth), truth, alignment
+        trajectory_error.align(random_similarity(rng, 1.0), ground_truth), ground_truth, alignment
     )
     assert result.max == pytest.approx(0, abs=1e-12)
     assert np.linalg.det(result.alignment.rotation) == pytest.approx(1)
@@ -282,11 +284,11 @@ def test_a_camera_on_a_line_is_aligned(alignment):
 @pytest.mark.parametrize("alignment", ["se3", "sim3"])
 def test_an_estimate_at_rest_misses_the_spread_of_the_truth(alignment):
     rng = np.random.default_rng(8)
-    truth = random_poses(rng, 7)
+    ground_truth = random_poses(rng, 7)
     estimate = np.tile(np.eye(4), (7, 1, 1))
     estimate[:, :3, 3] = [0.1, 0.7, 0.3]
-    result = trajectory_error.ate(estimate, truth, alignment)
-    assert result.rmse == pytest.approx(np.sqrt(truth[:, :3, 3].var(0).sum()))
+    result = trajectory_error.ate(estimate, ground_truth, alignment)
+    assert result.rmse == pytest.approx(np.sqrt(ground_truth[:, :3, 3].var(0).sum()))
     assert result.alignment.scale == 1
     np.testing.assert_array_equal(result.alignment.rotation, np.eye(3))
 
@@ -336,28 +338,28 @@ def test_pairs_are_the_nearest_within_a_tenth(seed, delta):
     """Against trying every pair; steps on a grid, so that stretches at rest and equal distances happen."""
     rng = np.random.default_rng(seed)
     steps = rng.choice([0.0, 0.25, 0.26, 1.0], size=29)
-    truth = np.tile(np.eye(4), (30, 1, 1))
-    truth[1:, 0, 3] = np.cumsum(steps)
-    along = trajectory_error.path_length(truth)
-    np.testing.assert_allclose(along, truth[:, 0, 3], atol=1e-12)
+    ground_truth = np.tile(np.eye(4), (30, 1, 1))
+    ground_truth[1:, 0, 3] = np.cumsum(steps)
+    along = trajectory_error.path_length(ground_truth)
+    np.testing.assert_allclose(along, ground_truth[:, 0, 3], atol=1e-12)
     expected = []
     for i in range(30):
         off = np.abs(along[i + 1 :] - along[i] - delta)
         if len(off) and off.min() <= 0.1 * delta:
             expected.append((i, i + 1 + int(off.argmin())))
-    estimate = truth.copy()
+    estimate = ground_truth.copy()
     estimate[:, 0, 3] *= 1.1
     if expected:
-        found = trajectory_error.rpe(estimate, truth, delta, along=along)
-        lengths = [0.1 * (truth[j, 0, 3] - truth[i, 0, 3]) for i, j in expected]
+        found = trajectory_error.rpe(estimate, ground_truth, delta, along=along)
+        lengths = [0.1 * (ground_truth[j, 0, 3] - ground_truth[i, 0, 3]) for i, j in expected]
         np.testing.assert_allclose(found.translation_errors_m, lengths, atol=1e-12)
     else:
         with pytest.raises(DataError, match="apart"):
-            trajectory_error.rpe(estimate, truth, delta, along=along)
+            trajectory_error.rpe(estimate, ground_truth, delta, along=along)
 
 
 def test_a_path_is_not_cut_by_poses_that_are_missing():
-    truth = np.tile(np.eye(4), (5, 1, 1))
-    truth[:, 1, 3] = [0, 1, 3, 2, 4]
-    truth[[0, 2]] = np.nan
-    np.testing.assert_array_equal(trajectory_error.path_length(truth), [0, 0, 0, 1, 3])
+    ground_truth = np.tile(np.eye(4), (5, 1, 1))
+    ground_truth[:, 1, 3] = [0, 1, 3, 2, 4]
+    ground_truth[[0, 2]] = np.nan
+    np.testing.assert_array_equal(trajectory_error.path_length(ground_truth), [0, 0, 0, 1, 3])

@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from jaxpose.datasets.events import registry as event_registry
 from jaxpose.errors import DataError
 from jaxpose.events import Events, simulate
-from jaxpose.events.contrast import find_slide, locate, warped
+from jaxpose.events.contrast import find_displacement, locate, warped
 from jaxpose.geometry.camera import Camera
 
 CAMERA = Camera(60.0, 60.0, 31.5, 23.5, 64, 48)
@@ -56,7 +56,7 @@ def steps():
 
 def test_the_slide_of_a_camera_before_two_walls_is_found(steps):
     events, velocity = steps
-    slide = find_slide(CAMERA, events)
+    slide = find_displacement(CAMERA, events)
     angle = np.degrees(np.arctan2(*slide.velocity[[1, 0]]) - np.arctan2(*velocity[[1, 0]]))
     assert abs(angle) < 4
     assert slide.velocity[2] == 0
@@ -76,14 +76,14 @@ def test_the_slide_of_a_camera_before_two_walls_is_found(steps):
 def test_few_events_are_refused(steps):
     few = Events(*(column[:50] for column in steps[0]))
     with pytest.raises(DataError, match="at least 100 events, got 50"):
-        find_slide(CAMERA, few)
+        find_displacement(CAMERA, few)
 
 
 @pytest.mark.data
 @pytest.mark.slow
 def test_the_slider_of_a_real_recording(data_dir):
     recording = event_registry.load(data_dir / "ecd_slider_depth")
-    slide = find_slide(recording.camera, recording.events)
+    slide = find_displacement(recording.camera, recording.events)
     first, last = recording.T_world_cam[[0, -1]]
     way = first[:3, :3].T @ (last[:3, 3] - first[:3, 3])
     cosine = way @ slide.velocity / np.linalg.norm(way) / np.linalg.norm(slide.velocity)

@@ -9,10 +9,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 from jaxpose.errors import DataError
 from jaxpose.events import (
     Events,
-    Streams,
-    by_pixel,
+    PixelIndex,
     change_residual,
-    level_at,
+    cumulative_polarity,
+    index_by_pixel,
     log_intensity,
     mosaic_mask,
     simulate,
@@ -22,7 +22,7 @@ HEIGHT, WIDTH = 6, 8
 
 
 def walk(seed=0, images=30, step=0.3):
-    """Log intensities that go up and down at random, and their stamps."""
+    """Log intensities that go up and down at random, and their timestamps."""
     generator = np.random.default_rng(seed)
     values = np.cumsum(generator.normal(0, step, (images, HEIGHT, WIDTH)), axis=0)
     return list(zip(0.1 * np.arange(images), values, strict=True))
@@ -108,7 +108,7 @@ def test_bad_settings_and_stamps_are_refused():
     for settings in ({"threshold": 0.0}, {"threshold": 0.1, "spread": -1.0}):
         with pytest.raises(ValueError, match="expected threshold > 0"):
             simulate(images, **settings)
-    with pytest.raises(DataError, match="stamps that increase, got 0.1 s after 0.2 s"):
+    with pytest.raises(DataError, match="timestamps that increase, got 0.1 s after 0.2 s"):
         simulate([images[0], images[2], images[1]], 0.1)
 
 
@@ -124,28 +124,31 @@ def test_the_mosaic_is_red_green_green_blue():
 
 def test_levels_at_any_time_are_those_of_a_plain_count():
     events = simulate(walk(1), 0.2)
-    streams = by_pixel(events, HEIGHT, WIDTH)
+    streams = index_by_pixel(events, HEIGHT, WIDTH)
     assert streams.count.sum() == len(events.t)
     same = np.diff(streams.pixel) == 0
     assert (np.diff(streams.t)[same] >= 0).all() and (np.diff(streams.pixel) >= 0).all()
-    device = Streams(*(jnp.asarray(x, jnp.float32 if x.dtype == float else jnp.int32) for x in streams))
-    read = jax.jit(jax.vmap(level_at, (None, 0, None)))
-    stamps = np.float32([-1.0, 0.0, 0.731, 1.5, 2.9, 10.0])
-    # Beside them the stamp of an event itself, which counts.
-    for t in [*stamps, np.float32(events.t[100])]:
+    device = PixelIndex(*(jnp.asarray(x, jnp.float32 if x.dtype == float else jnp.int32) for x in streams))
+    read = jax.jit(jax.vmap(cumulative_polarity, (None, 0, None)))
+    timestamps = np.float32([-1.0, 0.0, 0.731, 1.5, 2.9, 10.0])
+    # Beside them the timestamp of an event itself, which counts.
+    for t in [*timestamps, np.float32(events.t[100])]:
         as_stored = events._replace(t=np.asarray(events.t, np.float32).astype(np.float64))
         assert_array_equal(read(device, jnp.arange(HEIGHT * WIDTH), t), total(as_stored, float(t)).ravel())
 
 
 def test_pixels_without_events_have_no_level():
-    quiet = by_pixel(simulate([(0.0, np.zeros((2, 2))), (1.0, np.zeros((2, 2)))], 0.2), 2, 2)
-    device = Streams(*(jnp.asarray(x) for x in jax.tree.map(lambda x: x.astype(np.float32), quiet)))
-    assert level_at(device._replace(pixel=quiet.pixel), jnp.int32(3), jnp.float32(0.5)) == 0
+    quiet = index_by_pixel(simulate([(0.0, np.zeros((2, 2))), (1.0, np.zeros((2, 2)))], 0.2), 2, 2)
+    device = PixelIndex(*(jnp.asarray(x) for x in jax.tree.map(lambda x: x.astype(np.float32), quiet)))
+    assert cumulative_polarity(device._replace(pixel=quiet.pixel), jnp.int32(3), jnp.float32(0.5)) == 0
     one = Events(np.array([0.5]), np.uint16([1]), np.uint16([0]), np.int8([-1]))
-    streams = by_pixel(one, 2, 2)
+    streams = index_by_pixel(one, 2, 2)
     assert_array_equal(streams.count, [0, 1, 0, 0])
-    device = Streams(*(jnp.asarray(x, jnp.float32 if x.dtype == float else jnp.int32) for x in streams))
-    levels = [[int(level_at(device, jnp.int32(p), jnp.float32(t))) for p in range(4)] for t in (0.4, 0.5, 9)]
+    device = PixelIndex(*(jnp.asarray(x, jnp.float32 if x.dtype == float else jnp.int32) for x in streams))
+    levels = [
+        [int(cumulative_polarity(device, jnp.int32(p), jnp.float32(t))) for p in range(4)]
+        for t in (0.4, 0.5, 9)
+    ]
     assert levels == [[0, 0, 0, 0], [0, -1, 0, 0], [0, -1, 0, 0]]
 
 

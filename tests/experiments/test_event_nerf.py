@@ -64,12 +64,12 @@ def test_the_orbits_events_add_up_to_what_its_sensor_sees():
 
 def test_positions_are_linear_between_the_known_and_orientations_are_kept():
     problem = load(smoke(known=6))
-    truth, T = problem.recording.T_world_cam, problem.start.T
-    assert_allclose(T[:, :3, :3], truth[:, :3, :3])
+    ground_truth, T = problem.recording.T_world_cam, problem.start.T
+    assert_allclose(T[:, :3, :3], ground_truth[:, :3, :3])
     known = np.arange(0, 61, 10)
-    assert_allclose(T[known], truth[known])
-    assert_allclose(T[5, :3, 3], (truth[0, :3, 3] + truth[10, :3, 3]) / 2)
-    off = np.linalg.norm(T[:, :3, 3] - truth[:, :3, 3], axis=1)
+    assert_allclose(T[known], ground_truth[known])
+    assert_allclose(T[5, :3, 3], (ground_truth[0, :3, 3] + ground_truth[10, :3, 3]) / 2)
+    off = np.linalg.norm(T[:, :3, 3] - ground_truth[:, :3, 3], axis=1)
     assert off.max() > 4 * (1 - np.cos(np.pi / 6)) * 0.8  # the sagitta of a sixth of the circle
     assert load(smoke()).about["poses"].startswith("positions known at 10 instants")
     assert load(smoke(axis_offset_deg=1.0)).about["poses"].startswith("known at all 61 instants")
@@ -92,14 +92,14 @@ def test_what_a_run_leaves(finished):
     assert seen[-1].step == 100 and np.isfinite(seen[-1].loss)
     results = outcome.results
     problem = load(smoke())
-    truth = find_truth(problem)
-    assert truth is not None
+    ground_truth = find_truth(problem)
+    assert ground_truth is not None
     loaded = event_nerf.load_run(outcome.folder)
-    poses = training_loop.pose_reader(loaded.setup.field, truth.t)(loaded.state.pose)
-    errors = trajectory_error.pose_errors(poses, truth.T_world_cam)
+    poses = training_loop.pose_reader(loaded.setup.field, ground_truth.t)(loaded.state.pose)
+    errors = trajectory_error.pose_errors(poses, ground_truth.T_world_cam)
     assert errors.rotation_deg == pytest.approx(results["rotation_error_deg"], rel=1e-4)
     assert errors.translation == pytest.approx(results["translation_error"], rel=1e-4)
-    at_start = trajectory_error.pose_errors(truth.T_start, truth.T_world_cam)
+    at_start = trajectory_error.pose_errors(ground_truth.T_start, ground_truth.T_world_cam)
     assert at_start.translation == pytest.approx(results["start"]["translation_error"], rel=1e-6)
     reference, start = (
         trajectories.read_tum(outcome.folder / f"{name}.txt") for name in ("reference", "start")
@@ -156,14 +156,14 @@ def test_sigkill_in_the_middle_changes_no_number(tmp_path):
 
 def test_the_correction_undoes_a_slope_and_an_offset_of_log_intensity():
     generator = np.random.default_rng(0)
-    truth = generator.uniform(0.4, 0.9, (3, 8, 8, 3))
-    level = np.array([0.9, 0.8, 1.1]) * np.log(truth**2.2 + 0.1) + np.array([0.05, -0.1, 0.02])
+    ground_truth = generator.uniform(0.4, 0.9, (3, 8, 8, 3))
+    level = np.array([0.9, 0.8, 1.1]) * np.log(ground_truth**2.2 + 0.1) + np.array([0.05, -0.1, 0.02])
     rendered = (np.exp(level) - 0.1) ** (1 / 2.2)
-    assert np.abs(rendered - truth).max() > 0.02
-    assert_allclose(corrected(rendered, truth, 0.1), truth, atol=1e-9)
-    flat = np.full_like(truth, 0.5)
-    means = np.exp(np.log(truth**2.2 + 0.1).mean((0, 1, 2))) - 0.1
-    assert_allclose(corrected(flat, truth, 0.1)[0, 0, 0], means ** (1 / 2.2))
+    assert np.abs(rendered - ground_truth).max() > 0.02
+    assert_allclose(corrected(rendered, ground_truth, 0.1), ground_truth, atol=1e-9)
+    flat = np.full_like(ground_truth, 0.5)
+    means = np.exp(np.log(ground_truth**2.2 + 0.1).mean((0, 1, 2))) - 0.1
+    assert_allclose(corrected(flat, ground_truth, 0.1)[0, 0, 0], means ** (1 / 2.2))
 
 
 @pytest.mark.data

@@ -57,10 +57,12 @@ complaint = partial(refused.complaint, noisy_nerf.main)
 @pytest.mark.parametrize("side", ["world", "camera"])
 def test_noise_is_on_the_side_and_as_large_as_stated(side):
     problem = load(smoke(noise_translation=0.1, noise_rotation_deg=30.0, side=side, seed=3))
-    truth = problem.train.T_world_cam
+    ground_truth = problem.train.T_world_cam
     assert problem.extent == 8
     to_start = (
-        problem.T_start @ np.linalg.inv(truth) if side == "world" else np.linalg.inv(truth) @ problem.T_start
+        problem.T_start @ np.linalg.inv(ground_truth)
+        if side == "world"
+        else np.linalg.inv(ground_truth) @ problem.T_start
     )
     off = to_start if side == "camera" else np.linalg.inv(to_start)  # world-to-camera: T_c,w . T_noise
     assert np.linalg.norm(off[:, :3, 3], axis=1).max() == pytest.approx(0.8)

@@ -1,4 +1,4 @@
-"""Planar alignment: the truth it draws, the warps it optimises, and the command with its run folder."""
+"""Planar alignment: ground truth it draws, the warps it optimises, and the command with its run folder."""
 
 import json
 import re
@@ -62,7 +62,8 @@ def photograph(tmp_path) -> Path:
     return path
 
 
-# --- the truth ------------------------------------------------------------------------------------------
+# --- the ground truth
+# ------------------------------------------------------------------------------------------
 
 
 def test_photographs_are_read_as_they_are_or_reduced(tmp_path, photograph):
@@ -117,11 +118,11 @@ def test_patches_show_what_the_image_has_there():
 def test_corner_errors_of_known_displacements():
     photo, turn = ramp(480, 360), 0.1
     zero = np.zeros(3)
-    truth = planar_task.rigid(zero, zero, zero)
+    ground_truth = planar_task.rigid(zero, zero, zero)
     estimate = planar_task.rigid(
         np.array([0, 3 / 240, 0]), np.array([0, -4 / 240, 0]), np.array([0, 0, turn])
     )
-    errors = planar_task.corner_errors(photo, estimate, truth)
+    errors = planar_task.corner_errors(photo, estimate, ground_truth)
     assert_allclose(errors, [0, 5, 2 * np.sin(turn / 2) * 90 * np.sqrt(2)], atol=1e-9)
 
 
@@ -301,7 +302,7 @@ def test_a_killed_run_resumed_has_the_numbers_of_a_whole_one(photograph, tmp_pat
 
 @pytest.fixture
 def found_at_once(monkeypatch):
-    """Alignment without work: the truth, 0.5 px off in x."""
+    """Alignment without work: the ground truth, 0.5 px off in x."""
 
     def quick(compiled, photo, task, key, steps, on_chunk=None):
         H = task.H_image_patch + np.eye(3)[0][:, None] * np.eye(3)[2] * 0.5 / photo.unit

@@ -88,11 +88,13 @@ def test_run_folder_of_imu_slam(finished):
 
 def test_numbers_are_those_of_the_files(finished):
     folder, results = finished
-    estimate, truth = (
+    estimate, ground_truth = (
         trajectories.read_tum(folder / "trajectory.txt"),
         trajectories.read_tum(folder / "reference.txt"),
     )
-    assert results["ate_rmse_m"] == pytest.approx(trajectory_error.ate(estimate.T, truth.T).rmse, abs=1e-9)
+    assert results["ate_rmse_m"] == pytest.approx(
+        trajectory_error.ate(estimate.T, ground_truth.T).rmse, abs=1e-9
+    )
     assert results["ate_rmse_m"] < 0.02
     np.testing.assert_allclose(estimate.t, np.arange(FRAMES) / 5)
 

@@ -78,7 +78,9 @@ STAMPS = np.array([0.0, 0.5, 2.0])
 def stamped_screw(dtype):
     """Stamped poses of a screw motion, which interpolation at constant twist reproduces."""
     poses = np.array([screw(t) for t in STAMPS])
-    return jax.jit(lambda t: fields.stamped(jnp.asarray(STAMPS, dtype), jnp.asarray(poses, dtype))(t))
+    return jax.jit(
+        lambda t: fields.piecewise_geodesic(jnp.asarray(STAMPS, dtype), jnp.asarray(poses, dtype))(t)
+    )
 
 
 @pytest.mark.parametrize("t", [0.0, 0.1, 0.5, 0.51, 1.3, 2.0])
@@ -97,14 +99,14 @@ def test_stamped_poses_stand_still_outside(t, end):
 
 @pytest.mark.parametrize("t", [0.0, 0.5, 1.0, 2.0])
 def test_stamped_poses_move_at_the_ends_too(t):
-    """Exactly at the first stamp, where a clipped fraction would have half the derivative."""
+    """Exactly at the first timestamp, where a clipped fraction would have half the derivative."""
     _, linear, angular = jax.jit(partial(velocity, stamped_screw(jnp.float32)))(jnp.asarray(t))
     assert_allclose(linear, screw(t)[:3, :3] @ np.asarray(TWIST[:3]), atol=3e-6)
     assert_allclose(angular, TWIST[3:], atol=3e-6)
 
 
 def test_one_stamp_is_a_constant():
-    pose = fields.stamped(jnp.asarray([1.0]), jnp.asarray(T_REF[None]))
+    pose = fields.piecewise_geodesic(jnp.asarray([1.0]), jnp.asarray(T_REF[None]))
     assert_allclose(pose(jnp.asarray(5.0)), T_REF)
 
 

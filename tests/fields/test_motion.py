@@ -124,14 +124,14 @@ def assert_relative(actual, expected, tolerance):
 
 
 @pytest.mark.parametrize(
-    ("pose_fn", "truth"),
+    ("pose_fn", "ground_truth"),
     [(helix, helix_truth), (tumble, tumble_truth), (composed, composed_truth)],
 )
-def test_closed_form_trajectories(pose_fn, truth, dtype):
+def test_closed_form_trajectories(pose_fn, ground_truth, dtype):
     """1000 times under jit and vmap, every field of the motion, and the first-order function beside it."""
     both = jax.jit(jax.vmap(lambda s: (motion(pose_fn, s), velocity(pose_fn, s))))
     actual, first_order = both(jnp.asarray(TIMES, dtype))
-    expected = truth()
+    expected = ground_truth()
     for field, value in actual._asdict().items():
         assert value.dtype == dtype
         assert_relative(value, getattr(expected, field), TOLERANCE[dtype])

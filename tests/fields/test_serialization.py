@@ -86,7 +86,7 @@ def test_table(tmp_path):
     params = random_like(field.init(jax.random.key(0)), scale=2.0)
     between = np.array([*TIMES, *(STAMPS[1:] + STAMPS[:-1]) / 2])  # on the borders too
     expected = poses_of(field, params, between)
-    assert_agrees(tmp_path, expected, [serialization.table_factor(STAMPS, params)], between)
+    assert_agrees(tmp_path, expected, [serialization.per_frame_factor(STAMPS, params)], between)
 
 
 def turns(angles):
@@ -97,22 +97,25 @@ def turns(angles):
 
 @pytest.mark.parametrize("angles", [[0, 0, 1e-9, 1e-4, 0.3], [0, 3.1, 0.01, 2.9, -0.2], [0, 1, 2, 3, 4]])
 def test_stamped_at_small_and_large_angles(tmp_path, angles):
-    poses, stamps = turns(angles), jnp.asarray(STAMPS)
-    field = fields.PoseField(lambda key: None, lambda _, t: fields.stamped(stamps, poses)(t))
-    assert_agrees(tmp_path, poses_of(field, 0), [serialization.stamped_factor(stamps, poses)])
+    poses, timestamps = turns(angles), jnp.asarray(STAMPS)
+    field = fields.PoseField(lambda key: None, lambda _, t: fields.piecewise_geodesic(timestamps, poses)(t))
+    assert_agrees(tmp_path, poses_of(field, 0), [serialization.piecewise_geodesic_factor(timestamps, poses)])
 
 
 @pytest.mark.parametrize("side", ["body", "world"])
 def test_a_refined_start_and_a_camera_on_a_body(tmp_path, side):
     config = PoseNetConfig(span=SPAN, layers=3, width=8, translation_scale=2.0)
-    inner, initial = fields.posenet(config), fields.stamped(jnp.asarray(STAMPS), turns([0, 1, 2, 1, 0]))
+    inner, initial = (
+        fields.posenet(config),
+        fields.piecewise_geodesic(jnp.asarray(STAMPS), turns([0, 1, 2, 1, 0])),
+    )
     T_body_cam = turns([0, 0.7])[1]
     refined = fields.refine(inner, initial, side=side)
     field = refined._replace(
         pose=lambda params, t: fields.body_to_camera(lambda s: refined.pose(params, s), T_body_cam)(t)
     )
     params = random_like(inner.init(jax.random.key(1)))
-    start = serialization.stamped_factor(jnp.asarray(STAMPS), turns([0, 1, 2, 1, 0]))
+    start = serialization.piecewise_geodesic_factor(jnp.asarray(STAMPS), turns([0, 1, 2, 1, 0]))
     correction = serialization.posenet_factor(config, params)
     factors = [start, correction] if side == "body" else [correction, start]
     factors.append(serialization.constant_factor(T_body_cam))
@@ -129,7 +132,7 @@ def test_an_alignment_scales_every_family(tmp_path, kind):
     factor = (
         serialization.bspline_factor(SPAN, params)
         if kind == "bspline"
-        else serialization.table_factor(STAMPS, params)
+        else serialization.per_frame_factor(STAMPS, params)
     )
     alignment = rigid.Similarity(0.3, np.asarray(turns([1.0])[0, :3, :3]), np.array([1.0, 2.0, 3.0]))
     expected = trajectory_error.align(alignment, poses_of(field, params))

@@ -126,11 +126,15 @@ KITTI_LINE = "1 0 0 0 0 1 0 0 0 0 1 0\n"
             "trajectory:2: expected finite numbers, got '2 0 0 0 0 nan",
         ),
         (trajectories.read_tum, TUM_LINE + "2 0 inf 0 0 0 0 1\n", "trajectory:2: expected finite numbers"),
-        (trajectories.read_tum, TUM_LINE + TUM_LINE, "trajectory:2: expected a stamp after 1.0 s, got 1.0 s"),
+        (
+            trajectories.read_tum,
+            TUM_LINE + TUM_LINE,
+            "trajectory:2: expected a timestamp after 1.0 s, got 1.0 s",
+        ),
         (
             trajectories.read_tum,
             TUM_LINE + "0.5" + TUM_LINE[1:],
-            "trajectory:2: expected a stamp after 1.0 s, got 0.5 s",
+            "trajectory:2: expected a timestamp after 1.0 s, got 0.5 s",
         ),
         (trajectories.read_tum, "\x00\x89PNG\n", "trajectory:1: expected 8 numbers"),
         (trajectories.read_euroc, EUROC_LINE + "1 2 3\n", "trajectory:2: expected 17 numbers .*, got 1"),
@@ -177,7 +181,7 @@ def test_missing_truth_is_left_out_of_tum_and_refused_by_kitti(tmp_path):
 
 # --- association ----------------------------------------------------------------------------------------
 
-# Stamps on a grid, so that equal distances and repeated partners happen.
+# Timestamps on a grid, so that equal distances and repeated partners happen.
 STAMPS = st.lists(st.integers(0, 60), min_size=1, max_size=25, unique=True).map(lambda x: np.sort(x) / 4.0)
 
 
@@ -207,10 +211,12 @@ def test_associate_finds_the_nearest(t_a, t_b):
 
 
 @pytest.mark.parametrize(
-    "t_b, found", [(np.array([9.0, 10.0]), "9.000 to 10.000 s"), (np.array([]), "no stamps")]
+    "t_b, found", [(np.array([9.0, 10.0]), "9.000 to 10.000 s"), (np.array([]), "no timestamps")]
 )
 def test_disjoint_stamps_are_refused(t_b, found):
-    with pytest.raises(DataError, match=f"expected stamps within 0.01 s, got 0.000 to 2.000 s and {found}"):
+    with pytest.raises(
+        DataError, match=f"expected timestamps within 0.01 s, got 0.000 to 2.000 s and {found}"
+    ):
         trajectories.associate(np.array([0.0, 1.0, 2.0]), t_b)
 
 

@@ -1,4 +1,4 @@
-"""Trajectory files whose format is found by what is in them: round trips, stamps, and what is refused."""
+"""Trajectory files whose format is found by what is in them: round trips, timestamps, and what is refused."""
 
 import numpy as np
 import pytest
@@ -48,7 +48,7 @@ def test_euroc_is_read_by_another(tmp_path):
 
 def test_what_euroc_cannot_hold(tmp_path):
     written = trajectory(3, start=0.0)
-    with pytest.raises(DataError, match="stamps at least 1 ns apart"):
+    with pytest.raises(DataError, match="timestamps at least 1 ns apart"):
         trajectories.write_euroc(tmp_path / "out", written._replace(t=np.array([0, 1e-10, 2e-10])))
     written.T[1] = np.nan
     with pytest.raises(DataError, match="out: expected finite poses, got NaN or infinity in row 1"):
@@ -64,7 +64,7 @@ def test_of_equal_stamps_the_first_is_kept_and_counted(tmp_path):
     np.testing.assert_array_equal(read.trajectory.t, [1, 2, 3])
     np.testing.assert_array_equal(read.trajectory.T[:, 0, 3], [0, 5, 7])
     (tmp_path / "tum").write_text("\n".join([*lines, "2.5 0 0 0 0 0 0 1"]))
-    with pytest.raises(DataError, match="tum:5: expected a stamp after 3.0 s, got 2.5 s"):
+    with pytest.raises(DataError, match="tum:5: expected a timestamp after 3.0 s, got 2.5 s"):
         trajectory_reader.read_trajectory(tmp_path / "tum")
 
 
@@ -89,7 +89,7 @@ def test_what_is_no_trajectory(tmp_path, text, message):
 
 
 def test_stamps_of_lists_and_tables(tmp_path):
-    file = tmp_path / "stamps"
+    file = tmp_path / "timestamps"
     file.write_text("# images\n1.5 rgb/1.5.png\n\n2.25 rgb/2.25.png\n")
     np.testing.assert_array_equal(trajectory_reader.read_stamps(file), [1.5, 2.25])
     file.write_text("#timestamp [ns],w\n1403715523912140000,-0.1\n1403715523917140000,0.2\n")
@@ -97,10 +97,10 @@ def test_stamps_of_lists_and_tables(tmp_path):
         trajectory_reader.read_stamps(file), [1403715523.91214, 1403715523.91714], rtol=0, atol=3e-7
     )
     for text, message in (
-        ("1\n\nx\n", "stamps:3: expected a line that begins with a stamp, got 'x'"),
-        ("1\nnan\n", "stamps:2: expected a line that begins with a stamp"),
-        ("1\n1\n", "stamps:2: expected a stamp after 1.0 s, got 1.0 s"),
-        ("# none\n", "stamps: expected lines that begin with a stamp, got none"),
+        ("1\n\nx\n", "timestamps:3: expected a line that begins with a timestamp, got 'x'"),
+        ("1\nnan\n", "timestamps:2: expected a line that begins with a timestamp"),
+        ("1\n1\n", "timestamps:2: expected a timestamp after 1.0 s, got 1.0 s"),
+        ("# none\n", "timestamps: expected lines that begin with a timestamp, got none"),
     ):
         file.write_text(text)
         with pytest.raises(DataError, match=message):

@@ -20,12 +20,12 @@ accelerometer_random_walk: 3.0000e-3
 """
 
 
-def truth_line(stamp, position=(1, 2, 3), quaternion=(0.5, 0.5, 0.5, 0.5)):
-    return ",".join(map(str, [stamp, *position, *quaternion, *range(4, 13)]))
+def truth_line(timestamp, position=(1, 2, 3), quaternion=(0.5, 0.5, 0.5, 0.5)):
+    return ",".join(map(str, [timestamp, *position, *quaternion, *range(4, 13)]))
 
 
 def write_sequence(folder):
-    """A made-up recording: two readings and two lines of truth."""
+    """A made-up recording: two readings and two lines of ground truth."""
     for name in ("imu0", "state_groundtruth_estimate0"):
         (folder / "mav0" / name).mkdir(parents=True)
     imu = [
@@ -36,6 +36,10 @@ def write_sequence(folder):
     ]
     (folder / "mav0/imu0/data.csv").write_text("\r\n".join(imu))
     (folder / "mav0/imu0/sensor.yaml").write_text(SENSOR)
-    truth = ["#timestamp", truth_line(T0 + 1000000000), truth_line(T0 + 1005000000, (1, 2, 4), (-1, 0, 0, 0))]
-    (folder / "mav0/state_groundtruth_estimate0/data.csv").write_text("\n".join(truth) + "\n")
+    ground_truth = [
+        "#timestamp",
+        truth_line(T0 + 1000000000),
+        truth_line(T0 + 1005000000, (1, 2, 4), (-1, 0, 0, 0)),
+    ]
+    (folder / "mav0/state_groundtruth_estimate0/data.csv").write_text("\n".join(ground_truth) + "\n")
     return folder

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from jaxpose.slam.map.integrate import Nearby
+from jaxpose.slam.map.integrate import MapSample
 from jaxpose.slam.observation import Pixels
 
 LOWER, UPPER = np.float32([-2, -1.5, -1]), np.float32([2, 1.5, 3])
@@ -13,7 +13,7 @@ def inside_of_a_box(point):
     """What a map that knows everything says of a point."""
     lower, upper = LOWER.astype(point.dtype), UPPER.astype(point.dtype)
     distance = jnp.min(jnp.concatenate([point - lower, upper - point]))
-    return Nearby(distance, 0.5 + 0.4 * jnp.sin(3 * point), jnp.ones_like(distance))
+    return MapSample(distance, 0.5 + 0.4 * jnp.sin(3 * point), jnp.ones_like(distance))
 
 
 def box_pixels(T_world_cam, count):

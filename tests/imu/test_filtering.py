@@ -1,9 +1,9 @@
 """The filter on readings and poses: closed-form motion with known noise, and the real recordings of EuRoC.
 
-The truth files of EuRoC are smoothed fusions of motion capture and this very IMU, not raw measurements. To
-act as measurements their poses, thinned to 20 Hz, get white noise of 1 mm and 0.1 degrees per axis,
-from a fixed seed. The data sheet knows no vibration of rotors: the densities here are those of the highest
-likelihood on the first half of V1_02. Its second half and V1_01 had no part in that.
+The ground truth files of EuRoC are smoothed fusions of motion capture and this very IMU, not raw
+measurements. To act as measurements their poses, thinned to 20 Hz, get white noise of 1 mm and 0.1 degrees
+per axis, from a fixed seed. The data sheet knows no vibration of rotors: the densities here are those of the
+highest likelihood on the first half of V1_02. Its second half and V1_01 had no part in that.
 """
 
 import jax
@@ -43,7 +43,7 @@ def measured(poses, seed):
 
 
 @pytest.fixture(scope="module")
-def truth():
+def ground_truth():
     """Ten seconds at 200 Hz, without noise."""
     with jax.enable_x64(True):
         t = jnp.arange(2000) / 200
@@ -51,15 +51,15 @@ def truth():
 
 
 @pytest.fixture(scope="module")
-def recordings(truth):
-    """Per seed: biased noisy readings, pose stamps (20 Hz, between the readings') and measured poses."""
+def recordings(ground_truth):
+    """Per seed: biased noisy readings, pose timestamps (20 Hz, between the readings') and measured poses."""
     with jax.enable_x64(True):
         read = jax.jit(lambda t, key: simulate(lissajous, t, noise=ADIS16448, key=key))
         at = np.arange(199) / 20 + 0.0017
         poses = np.asarray(jax.jit(jax.vmap(lissajous))(jnp.asarray(at)))
         made = []
         for seed in range(5):
-            imu = jax.tree.map(np.asarray, read(jnp.asarray(truth[0]), jax.random.key(seed)))
+            imu = jax.tree.map(np.asarray, read(jnp.asarray(ground_truth[0]), jax.random.key(seed)))
             biased = Imu(imu.t, imu.omega_body + GYRO_BIAS, imu.acceleration_body + ACCELEROMETER_BIAS)
             made.append((biased, at, measured(poses, seed)))
     return made
@@ -81,8 +81,8 @@ def test_innovations_are_as_large_as_stated(recordings):
     assert low < np.mean(nis) < high
 
 
-def test_motion_and_biases_of_a_simulated_body(recordings, truth):
-    _, true = truth
+def test_motion_and_biases_of_a_simulated_body(recordings, ground_truth):
+    _, true = ground_truth
     for run in recordings[:3]:
         imu = run[0]
         online = filter_imu(*run, ADIS16448, POSE_NOISE)
@@ -163,14 +163,17 @@ def changed(imu, row, **values):
 @pytest.mark.parametrize(
     "change, message",
     [
-        (lambda i, t, T: (changed(i, 7, t=0.0), t, T), r"IMU: expected rising stamps, got 0.0 after 0.03 s"),
+        (
+            lambda i, t, T: (changed(i, 7, t=0.0), t, T),
+            r"IMU: expected rising timestamps, got 0.0 after 0.03 s",
+        ),
         (lambda i, t, T: (changed(i, 7, omega_body=np.nan), t, T), "IMU: .* got NaN or infinity in row 7"),
         (
             lambda i, t, T: (changed(i, slice(900, None), t=i.t[900:] + 1), t, T),
             r"IMU: .* at most 0.05 s apart .* got 1 s after 4.495 s",
         ),
         (lambda i, t, T: (Imu(*(x[:1] for x in i)), t, T), "at least 2 finite readings, got 1"),
-        (lambda i, t, T: (i, t[::-1], T), "poses: expected rising stamps"),
+        (lambda i, t, T: (i, t[::-1], T), "poses: expected rising timestamps"),
         (
             lambda i, t, T: (i, t + 100, T),
             r"at least 2 finite ones within .* \(0.000 to 9.995 s\), got 0 of 199",
@@ -198,7 +201,7 @@ def test_impossible_noise(recordings, noise, pose_noise):
 
 
 def real(folder, every):
-    """Readings, noisy poses at 20 Hz and the truth; poses end with the readings."""
+    """Readings, noisy poses at 20 Hz and the ground truth; poses end with the readings."""
     imu, true = euroc.load_imu(folder).imu, euroc.load_truth(folder)
     at = true.t[::every][true.t[::every] <= imu.t[-1]]
     return (imu, at, measured(true.T_world_body[::every][: len(at)], seed=0)), true
@@ -209,7 +212,7 @@ def real(folder, every):
     "name, every", [("euroc_V1_02_medium", 10), pytest.param("euroc_V1_01_easy", 1, marks=pytest.mark.slow)]
 )
 def test_real_recordings(data_dir, name, every):
-    """Consistent innovations over the run, and the bias of the truth file; see the top of this file."""
+    """Consistent innovations over the run, and the bias of ground truth file; see the top of this file."""
     run, true = real(data_dir / name, every)
     found = filter_imu(*run, VIBRATING, POSE_NOISE, smooth=True)
     nis = found.nis[np.isfinite(found.nis)]

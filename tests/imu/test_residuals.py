@@ -77,9 +77,9 @@ def test_gravity_is_removed_exactly(dtype):
     times = jnp.linspace(0, 2, 9, dtype=dtype)
     gravity = (1.0, 2.0, -9.0)
     imu = jax.jit(lambda times: simulate(tumbling, times, gravity_world=gravity))(times)
-    truth = jax.jit(jax.vmap(lambda t: motion(tumbling, t)))(times)
-    R_world_body = truth.pose[:, :3, :3]
-    expected = np.einsum("nji,nj->ni", R_world_body, truth.acceleration_world)
+    ground_truth = jax.jit(jax.vmap(lambda t: motion(tumbling, t)))(times)
+    R_world_body = ground_truth.pose[:, :3, :3]
+    expected = np.einsum("nji,nj->ni", R_world_body, ground_truth.acceleration_world)
     acceleration = remove_gravity(imu, R_world_body, gravity)
     np.testing.assert_allclose(acceleration, expected, atol=TOLERANCE[dtype])
 
@@ -208,9 +208,9 @@ def test_integration_at_a_constant_rate_is_exact(dtype):
 def test_integration_is_of_second_order():
     @jax.jit
     def error(times):
-        truth = jax.vmap(lambda t: motion(tumbling, t))(times)
-        R_world_body = truth.pose[:, :3, :3]
-        return abs(integrate_gyro(R_world_body[0], times, truth.omega_body) - R_world_body).max()
+        ground_truth = jax.vmap(lambda t: motion(tumbling, t))(times)
+        R_world_body = ground_truth.pose[:, :3, :3]
+        return abs(integrate_gyro(R_world_body[0], times, ground_truth.omega_body) - R_world_body).max()
 
     with jax.enable_x64(True):
         coarse, fine = (float(error(jnp.linspace(0, 1, count + 1))) for count in (50, 100))

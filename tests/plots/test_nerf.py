@@ -49,23 +49,23 @@ def moved(T, by):
 
 
 def frusta(axes):
-    """The drawn edges of truth and of the other poses; the first collection joins their centres."""
+    """The drawn edges of ground truth and of the other poses; the first collection joins their centres."""
     return [np.array(collection._segments3d) for collection in axes.collections][1:]
 
 
 @pytest.mark.parametrize("case", ["path", "jumps", "in one place", "gaps", "y down", "two"])
 def test_cameras(tmp_path, figures, case):
-    truth = circle(2 if case == "two" else 60)
+    ground_truth = circle(2 if case == "two" else 60)
     if case == "jumps":
-        truth = truth[np.random.default_rng(1).permutation(60)]
+        ground_truth = ground_truth[np.random.default_rng(1).permutation(60)]
     if case == "y down":
-        truth = np.diag([1.0, -1, -1, 1]) @ truth
-    start, estimate = moved(truth, 80.0), moved(truth, 5.0)
+        ground_truth = np.diag([1.0, -1, -1, 1]) @ ground_truth
+    start, estimate = moved(ground_truth, 80.0), moved(ground_truth, 5.0)
     if case == "in one place":
-        start[:, :3, 3] = truth[:, :3, 3].mean(0)
+        start[:, :3, 3] = ground_truth[:, :3, 3].mean(0)
     if case == "gaps":
         start[3] = np.nan
-    nerf_plots.cameras(tmp_path / "cameras.png", truth, start, estimate, "a title")
+    nerf_plots.cameras(tmp_path / "cameras.png", ground_truth, start, estimate, "a title")
     pixels = read(tmp_path / "cameras.png")
     half = pixels.shape[1] // 2
     body = slice(0, int(0.9 * len(pixels)))  # without the legend

@@ -37,19 +37,21 @@ def lost_frames(*which):
     return lost
 
 
-@pytest.mark.parametrize("case", ["gaps and lost", "no truth", "at rest"])
+@pytest.mark.parametrize("case", ["gaps and lost", "no ground truth", "at rest"])
 def test_trajectory(tmp_path, case):
-    truth = circle()
-    estimate = truth.copy()
+    ground_truth = circle()
+    estimate = ground_truth.copy()
     if case == "at rest":
-        estimate[:] = truth[:] = truth[0]
+        estimate[:] = ground_truth[:] = ground_truth[0]
     else:
         estimate[:, :3, 3] += 0.02 * np.random.default_rng(0).normal(size=(N, 3))
     if case == "gaps and lost":
-        truth[[0, 7, 8]] = np.nan
+        ground_truth[[0, 7, 8]] = np.nan
     path = tmp_path / "trajectory.png"
     lost = lost_frames(3, 4) if case == "gaps and lost" else lost_frames()
-    slam_plots.trajectory(path, estimate, None if case == "no truth" else truth, lost, "a title")
+    slam_plots.trajectory(
+        path, estimate, None if case == "no ground truth" else ground_truth, lost, "a title"
+    )
     assert read(path).shape == (round(5.2 * slam_plots.DPI), 11 * slam_plots.DPI, 3)
     assert [file.name for file in tmp_path.iterdir()] == ["trajectory.png"]  # no temporary file stays
 
@@ -66,7 +68,7 @@ def test_trajectory_is_seen_along_the_vertical_axis_of_the_world():
 def test_errors(tmp_path, lost):
     t = np.linspace(0, 6, N)
     translation = 0.01 + 0.01 * np.sin(t)
-    translation[4] = np.nan  # a frame without truth
+    translation[4] = np.nan  # a frame without ground truth
     slam_plots.errors(
         tmp_path / "errors.png", t, translation, 10 * translation, lost_frames(*lost), "a title"
     )

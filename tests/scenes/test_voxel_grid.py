@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.interpolate import RegularGridInterpolator
 
-from jaxpose.scenes import GridConfig, box, grid, grow, merge, node_positions
+from jaxpose.scenes import GridConfig, bounding_grid, grid, grow, merge, node_positions
 
 CONFIG = GridConfig((-0.5, 0.0, 1.0), (0.3, 0.4, 2.2), voxel=0.1, levels=2, truncation=0.3)
 AHEAD = jnp.array([0.0, 0.0, 1.0])
@@ -187,14 +187,14 @@ def test_growing_to_what_is_inside_changes_nothing():
 @pytest.mark.parametrize("levels", [1, 2])
 def test_a_box_covers_its_points(levels):
     points = np.random.default_rng(5).normal(size=(100, 3)) * [3, 1, 2]
-    config = box(points, levels=levels, nodes=400_000)
+    config = bounding_grid(points, levels=levels, nodes=400_000)
     assert np.all(points >= np.array(config.lower) + 0.2) and np.all(points <= np.array(config.upper) - 0.2)
     nodes = node_positions(config)
     assert nodes.shape[:3] == grid(config).init(jax.random.key(0))[-1].shape[:3]
     assert 300_000 < nodes[..., 0].size < 600_000
     assert_allclose(nodes[0, 0, 0], config.lower, rtol=1e-6)
     assert_allclose(nodes[-1, -1, -1], config.upper, rtol=1e-5)
-    assert box(points, voxel=0.5, levels=levels).voxel == 0.5
+    assert bounding_grid(points, voxel=0.5, levels=levels).voxel == 0.5
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Where the first camera stands in the world: by the truth, or upright by what an accelerometer reads."""
+"""Where the first camera stands in the world: by ground truth, or upright by what an accelerometer reads."""
 
 import numpy as np
 import pytest

@@ -12,7 +12,7 @@ from jaxpose.files.ply import read_points, write_ply
 from jaxpose.geometry.camera import Camera
 from jaxpose.scenes import GridConfig, node_positions
 from jaxpose.slam.keyframes import Keyframe
-from jaxpose.slam.map.mesh import cloud, mesh
+from jaxpose.slam.map.mesh import mesh, point_cloud
 from jaxpose.slam.observation import Image
 
 RADIUS = 0.5  # m
@@ -91,12 +91,12 @@ def test_nothing_seen_is_an_empty_mesh(values, keyframes):
 
 
 def test_the_cloud_has_one_measured_point_in_each_cube(keyframes):
-    points, rgb, faces = cloud(keyframes, CAMERA, 0.05)
+    points, rgb, faces = point_cloud(keyframes, CAMERA, 0.05)
     assert len(faces) == 0 and len(points) > 200
     assert np.abs(np.linalg.norm(points, axis=1) - RADIUS).max() < 1e-5
     assert len(np.unique(np.floor(points / 0.05), axis=0)) == len(points)
     assert np.abs(rgb.astype(int) - colour(points)).max() <= 1
-    assert len(cloud(keyframes[:1], CAMERA, 0.05).points) < len(points)
+    assert len(point_cloud(keyframes[:1], CAMERA, 0.05).points) < len(points)
 
 
 def test_written_meshes_open_in_another_program(values, keyframes, tmp_path):

@@ -85,12 +85,12 @@ def test_what_pixels_say_of_points():
     at = locate(CAMERA, jnp.asarray(points))
     seen = jax.jit(lambda: seen_by(image, CAMERA)(at))()
     assert_allclose(seen.distance(jnp.asarray(points)), points @ unit + 1.4, atol=1e-3)
-    assert_allclose(seen.facing(jnp.asarray(points)), -points @ unit, atol=1e-3)
+    assert_allclose(seen.incidence_cosine(jnp.asarray(points)), -points @ unit, atol=1e-3)
     ray = rays()[np.asarray(at.row), np.asarray(at.column)]
     cosine = -(ray @ unit) / np.linalg.norm(ray, axis=-1)
     there = depth[np.asarray(at.row), np.asarray(at.column)]
     sigma = lambda z: 0.0012 + 0.0019 * (z - 0.4) ** 2
-    assert_allclose(seen.worth, cosine * (sigma(1.0) / sigma(there)) ** 2, rtol=2e-3)
+    assert_allclose(seen.weight, cosine * (sigma(1.0) / sigma(there)) ** 2, rtol=2e-3)
     assert_allclose(seen.rgb, 0.2, rtol=1e-6)
     nowhere = jnp.array([[5.0, 0, 1], [0, 0, -1], [0.42, 0, 1]])
-    assert_array_equal(seen_by(image, CAMERA)(locate(CAMERA, nowhere)).worth, 0)
+    assert_array_equal(seen_by(image, CAMERA)(locate(CAMERA, nowhere)).weight, 0)

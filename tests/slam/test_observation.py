@@ -103,11 +103,11 @@ def test_a_pixel_shows_a_wall_at_its_z_depth():
     column, row = (x.ravel() for x in jnp.meshgrid(jnp.arange(4, 60, 11), jnp.arange(4, 44, 9)))
     pixels = read_pixels(image(), CAMERA, row, column)
     T, directions = np.asarray(T_world_cam, np.float64), np.asarray(pixels.direction_cam, np.float64)
-    truth = (2.5 - T[2, 3]) / (directions @ T[2, :3])
-    pixels = Pixels(pixels.direction_cam, jnp.asarray(truth + 0.03, jnp.float32), pixels.rgb)
+    ground_truth = (2.5 - T[2, 3]) / (directions @ T[2, :3])
+    pixels = Pixels(pixels.direction_cam, jnp.asarray(ground_truth + 0.03, jnp.float32), pixels.rgb)
     config = SampleConfig(surface=24)
     seen = jax.jit(partial(render_pixels, wall, config=config))(T_world_cam, pixels, FAR)
-    assert_allclose(seen.depth, truth, atol=2e-3)
+    assert_allclose(seen.depth, ground_truth, atol=2e-3)
     assert_allclose(seen.opacity, 1, atol=2e-3)
-    points = T[:3, 3] + truth[:, None] * directions @ T[:3, :3].T
+    points = T[:3, 3] + ground_truth[:, None] * directions @ T[:3, :3].T
     assert_allclose(seen.rgb, points / 4, atol=2e-3)

@@ -10,7 +10,7 @@ from helpers.wall import CAMERA, wall
 from numpy.testing import assert_allclose, assert_array_equal
 
 from jaxpose.scenes import GridConfig, grid, merge, node_positions
-from jaxpose.slam.map.integrate import look_up, make_fuse
+from jaxpose.slam.map.integrate import make_integrate, sample_map
 from jaxpose.slam.map.photometric import MapConfig, make_descend
 from jaxpose.slam.observation import Image, SampleConfig
 
@@ -59,8 +59,8 @@ def cosine(points):
     return 1 / np.sqrt((x / 60) ** 2 + (y / 60) ** 2 + 1)
 
 
-def fuse(images, shifts):
-    init, update = make_fuse(CONFIG, CAMERA, BAND)
+def integrate(images, shifts):
+    init, update = make_integrate(CONFIG, CAMERA, BAND)
     state = init(grid(CONFIG).init(jax.random.key(0)))
     for image, shift in zip(images, shifts, strict=True):
         state = update(state, image, pose(shift))
@@ -68,17 +68,17 @@ def fuse(images, shifts):
 
 
 def test_a_wall_seen_from_several_places_is_exact():
-    state = fuse([wall_image(s) for s in SHIFTS], SHIFTS)
+    state = integrate([wall_image(s) for s in SHIFTS], SHIFTS)
     distance = WALL_Z - node_positions(CONFIG)[..., 2].astype(np.float64)
-    known = seen_by_all(SHIFTS) & (distance > -BAND + 1e-4)
-    assert known.sum() > 1000
+    valid = seen_by_all(SHIFTS) & (distance > -BAND + 1e-4)
+    assert valid.sum() > 1000
     values = np.asarray(state.params[0])
-    assert_allclose(values[known, 0], np.minimum(distance, BAND)[known], atol=2e-6)
-    surface = known & (np.abs(distance) < BAND - 1e-4)
+    assert_allclose(values[valid, 0], np.minimum(distance, BAND)[valid], atol=2e-6)
+    surface = valid & (np.abs(distance) < BAND - 1e-4)
     assert_allclose(values[surface, 1:], 100 / 255, atol=1e-6)
     # What lies behind it was not seen.
     assert_allclose(values[distance < -BAND - 1e-4, 0], BAND, rtol=1e-6)
-    assert_array_equal(np.asarray(state.memory)[distance < -BAND - 1e-4, :2], 0)
+    assert_array_equal(np.asarray(state.fusion_state)[distance < -BAND - 1e-4, :2], 0)
 
 
 def slanted_image(normal, offset):
@@ -89,19 +89,19 @@ def slanted_image(normal, offset):
 def test_a_slanted_wall_has_its_true_distance():
     """Not that along the optical axis: views from different sides agree."""
     normal = np.array([0.6, 0.0, -0.8])
-    state = fuse([slanted_image(normal, 1.44)], SHIFTS[:1])
+    state = integrate([slanted_image(normal, 1.44)], SHIFTS[:1])
     distance = node_positions(CONFIG).astype(np.float64) @ normal + 1.44
-    known = seen_by_all(SHIFTS[:1], margin=3) & (distance > -BAND / 2)
-    assert known.sum() > 1000
+    valid = seen_by_all(SHIFTS[:1], margin=3) & (distance > -BAND / 2)
+    assert valid.sum() > 1000
     values = np.asarray(state.params[0])
-    assert_allclose(values[known, 0], np.minimum(distance, BAND)[known], atol=1e-3)
-    assert np.abs(distance[known]).min() < 0.01
+    assert_allclose(values[valid, 0], np.minimum(distance, BAND)[valid], atol=1e-3)
+    assert np.abs(distance[valid]).min() < 0.01
 
 
 def test_a_surface_at_a_grazing_angle_has_two_sides():
     """A floor 0.3 below the camera: the nodes of the cells that hold it are measured above and below."""
     normal, height = np.array([0.0, -1.0, 0.0]), 0.3
-    state = fuse([slanted_image(normal, height)], SHIFTS[:1])
+    state = integrate([slanted_image(normal, height)], SHIFTS[:1])
     values = np.asarray(state.params[0])
     distance = node_positions(CONFIG).astype(np.float64) @ normal + height
     below = seen_by_all(SHIFTS[:1], margin=3) & (distance < 0) & (distance > -CONFIG.voxel)
@@ -111,10 +111,10 @@ def test_a_surface_at_a_grazing_angle_has_two_sides():
 
 def test_tiles_leave_nothing_out(monkeypatch):
     """The grid's sides are no multiples of a tile's."""
-    tiled = fuse([wall_image(s) for s in SHIFTS], SHIFTS)
+    tiled = integrate([wall_image(s) for s in SHIFTS], SHIFTS)
     monkeypatch.setattr("jaxpose.slam.map.integrate._TILE", 1000)
-    whole = fuse([wall_image(s) for s in SHIFTS], SHIFTS)
-    assert np.asarray(whole.memory).any()
+    whole = integrate([wall_image(s) for s in SHIFTS], SHIFTS)
+    assert np.asarray(whole.fusion_state).any()
     jax.tree.map(partial(assert_allclose, atol=1e-6), tiled, whole)
 
 
@@ -122,7 +122,7 @@ def test_two_observations_are_weighted_as_numpy_does():
     """Inverse variances of the published sigma at the measured depths, times the cosine of incidence."""
     shifts, errors, greys = SHIFTS[[0, 3]], (0.03, -0.02), (50, 200)
     images = [wall_image(s, error=e, grey=g) for s, e, g in zip(shifts, errors, greys, strict=True)]
-    values = np.asarray(fuse(images, shifts).params[0])
+    values = np.asarray(integrate(images, shifts).params[0])
     depths = [WALL_Z - s[2] + e for s, e in zip(shifts, errors, strict=True)]
     weights = [(0.0012 + 0.0019 * (d - 0.4) ** 2) ** -2 for d in depths]
     nodes = node_positions(CONFIG).astype(np.float64)
@@ -138,8 +138,10 @@ def test_two_observations_are_weighted_as_numpy_does():
 
 def test_the_wide_distance_reaches_farther_and_knows_where_it_was_measured():
     """Closed form: a wall's distance, 8 voxels to both sides and no farther."""
-    state = fuse([wall_image(s) for s in SHIFTS], SHIFTS)
-    look = jax.jit(jax.vmap(partial(look_up, grid(CONFIG), CONFIG, True, state.params, state.memory)))
+    state = integrate([wall_image(s) for s in SHIFTS], SHIFTS)
+    look = jax.jit(
+        jax.vmap(partial(sample_map, grid(CONFIG), CONFIG, True, state.params, state.fusion_state))
+    )
     rng = np.random.default_rng(0)
     points = np.stack([*rng.uniform(-0.1, 0.1, (2, 400)), rng.uniform(1.25, 2.35, 400)], axis=1)
     near, distance = look(jnp.asarray(points, jnp.float32)), WALL_Z - points[:, 2]
@@ -147,14 +149,14 @@ def test_the_wide_distance_reaches_farther_and_knows_where_it_was_measured():
     assert (
         within.sum() > 200 and (beyond & (distance < 0)).sum() > 20 and (beyond & (distance > 0)).sum() > 20
     )
-    assert_array_equal(near.known[within], 1)
-    assert_array_equal(near.known[beyond], 0)
+    assert_array_equal(near.valid[within], 1)
+    assert_array_equal(near.valid[beyond], 0)
     assert_allclose(near.distance[within], distance[within], atol=3e-6)
     assert_allclose(near.rgb[np.abs(distance) < 0.1], 100 / 255, atol=1e-6)
 
 
 def test_pixels_without_depth_change_nothing():
-    init, update = make_fuse(CONFIG, CAMERA, BAND)
+    init, update = make_integrate(CONFIG, CAMERA, BAND)
     blind = wall_image(SHIFTS[0])._replace(depth=jnp.zeros((48, 64)))
     before = init(grid(CONFIG).init(jax.random.key(0)))
     after = update(jax.tree.map(jnp.copy, before), blind, pose(SHIFTS[0]))
@@ -164,14 +166,14 @@ def test_pixels_without_depth_change_nothing():
 def test_half_an_image_maps_half_the_wall():
     image = wall_image(SHIFTS[0])
     image = image._replace(depth=image.depth.at[:, :32].set(0))
-    state = fuse([image], SHIFTS[:1])
+    state = integrate([image], SHIFTS[:1])
     x = node_positions(CONFIG)[..., 0]
-    assert not np.any(np.asarray(state.memory)[x < -0.02])
-    assert np.any(np.asarray(state.memory)[x > 0.02])
+    assert not np.any(np.asarray(state.fusion_state)[x < -0.02])
+    assert np.any(np.asarray(state.fusion_state)[x > 0.02])
 
 
 def test_frames_do_not_recompile():
-    init, update = make_fuse(CONFIG, CAMERA, BAND)
+    init, update = make_integrate(CONFIG, CAMERA, BAND)
     state = init(grid(CONFIG).init(jax.random.key(0)))
     for shift in SHIFTS:
         state = update(state, wall_image(shift), pose(shift))
@@ -202,7 +204,7 @@ def test_the_gradient_finds_the_same_wall_and_compiles_once():
     near = seen_by_all(SHIFTS, margin=8) & (np.abs(distance) < 0.05)
     assert near.sum() > 100
     found = np.asarray(merge(state.params)[0])[near]
-    fused = np.asarray(fuse([wall_image(s) for s in SHIFTS], SHIFTS).params[0])[near]
+    fused = np.asarray(integrate([wall_image(s) for s in SHIFTS], SHIFTS).params[0])[near]
     assert np.median(np.abs(found[:, 0] - fused[:, 0])) < 2e-3
     assert np.abs(found[:, 0] - fused[:, 0]).max() < 1e-2
     assert_allclose(np.median(found[:, 1]), 100 / 255, atol=0.03)

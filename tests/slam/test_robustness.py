@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers.box import box_pixels, inside_of_a_box
+from helpers.bounding_grid import box_pixels, inside_of_a_box
 
 from jaxpose.datasets.synthetic import RoomConfig, room
 from jaxpose.datasets.types import Frame, Recording, select
@@ -15,8 +15,8 @@ from jaxpose.geometry import se3
 from jaxpose.geometry.camera import Camera
 from jaxpose.slam.keyframes import look
 from jaxpose.slam.pipeline import SlamConfig, run
-from jaxpose.slam.tracker import _bent, _looks_better, _unlike, _usual
-from jaxpose.slam.tracking.relocalise import CENTRES, search
+from jaxpose.slam.tracker import _distribute_correction, _is_appearance_outlier, _looks_better, _usual
+from jaxpose.slam.tracking.relocalise import CENTRES, relocalise
 from jaxpose.slam.tracking.steps import Tracked
 from jaxpose.slam.types import no_frames
 
@@ -29,33 +29,35 @@ def truncated_box(point):
     return near._replace(known=(jnp.abs(near.distance) < BAND).astype(near.distance.dtype))
 
 
-def off(T, truth):
+def off(T, ground_truth):
     """Distances [m, rad] of two poses."""
-    xi = np.asarray(se3.log(se3.compose(se3.inverse(jnp.asarray(T)), jnp.asarray(truth, jnp.float32))))
+    xi = np.asarray(se3.log(se3.compose(se3.inverse(jnp.asarray(T)), jnp.asarray(ground_truth, jnp.float32))))
     return np.linalg.norm(xi[:3]), np.linalg.norm(xi[3:])
 
 
 @pytest.fixture(scope="module")
 def find():
-    return jax.jit(lambda T, s, pixels, key: search(truncated_box, T, s, pixels, key))
+    return jax.jit(lambda T, s, pixels, key: relocalise(truncated_box, T, s, pixels, key))
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_search_finds_a_camera_that_prediction_missed(find, seed):
-    truth = np.asarray(se3.exp(jnp.array([0.1, -0.2, 0.3, 0.2, 0.1, -0.1])))
-    start = se3.compose(jnp.asarray(truth), se3.exp(jnp.array([0.2, -0.15, 0.1, 0.15, -0.1, 0.2])))
+    ground_truth = np.asarray(se3.exp(jnp.array([0.1, -0.2, 0.3, 0.2, 0.1, -0.1])))
+    start = se3.compose(jnp.asarray(ground_truth), se3.exp(jnp.array([0.2, -0.15, 0.1, 0.15, -0.1, 0.2])))
     centres = jnp.tile(start[None], (CENTRES, 1, 1))
-    found = find(centres, jnp.array([0.25, 0.25]), box_pixels(truth, 400), jax.random.key(seed))
-    metres, radians = off(found, truth)
-    assert off(start, truth)[0] > 0.25 and metres < 0.2 and radians < 0.1  # near enough to be aligned
+    found = find(centres, jnp.array([0.25, 0.25]), box_pixels(ground_truth, 400), jax.random.key(seed))
+    metres, radians = off(found, ground_truth)
+    assert off(start, ground_truth)[0] > 0.25 and metres < 0.2 and radians < 0.1  # near enough to be aligned
 
 
 def test_a_search_begins_at_every_centre(find):
-    truth = np.asarray(se3.exp(jnp.array([0.5, -0.2, 0.3, 0.2, 1.0, -0.1])))
+    ground_truth = np.asarray(se3.exp(jnp.array([0.5, -0.2, 0.3, 0.2, 1.0, -0.1])))
     away = [se3.exp(jnp.array([0.1 * k, 0.0, 0.0, 0.0, -0.05 * k, 0.0])) for k in range(CENTRES - 1)]
-    near = se3.compose(jnp.asarray(truth), se3.exp(jnp.array([0.05, -0.05, 0.1, 0.05, -0.1, 0.02])))
-    found = find(jnp.stack([*away, near]), jnp.array([0.2, 0.2]), box_pixels(truth, 400), jax.random.key(1))
-    metres, radians = off(found, truth)
+    near = se3.compose(jnp.asarray(ground_truth), se3.exp(jnp.array([0.05, -0.05, 0.1, 0.05, -0.1, 0.02])))
+    found = find(
+        jnp.stack([*away, near]), jnp.array([0.2, 0.2]), box_pixels(ground_truth, 400), jax.random.key(1)
+    )
+    metres, radians = off(found, ground_truth)
     assert metres < 0.08 and radians < 0.05
 
 
@@ -63,7 +65,7 @@ def test_lost_frames_lead_to_where_the_camera_is_found():
     t, frames = np.array([0.0, 1.0, 2.0, 4.0]), no_frames(4)
     frames = frames.put(np.arange(4), T_world_body=np.eye(4), lost=[False, True, True, False])
     correction = np.asarray(se3.exp(jnp.array([0.4, 0.0, 0.0, 0.0, 0.0, 0.8])), np.float64)
-    bent = _bent(frames, t, 0, 3, correction)
+    bent = _distribute_correction(frames, t, 0, 3, correction)
     np.testing.assert_array_equal(bent.T_world_body[[0, 3]], np.tile(np.eye(4), (2, 1, 1)))
     for i, share in ((1, 0.25), (2, 0.5)):
         expected = np.asarray(se3.exp(share * jnp.array([0.4, 0.0, 0.0, 0.0, 0.0, 0.8])))
@@ -92,14 +94,16 @@ def test_what_is_usual_is_that_of_the_last_frames_found():
 
 def test_colours_of_another_place_are_doubted_until_they_must_be_another_light():
     t, frames = np.arange(20) / 4, no_frames(20).put(np.arange(1, 5), colour_error=0.01)
-    assert not _unlike(frames, t, 1, 0.5)  # nothing is usual yet
-    assert not _unlike(frames, t, 5, 0.024) and _unlike(frames, t, 5, 0.026)
-    frames = frames.put(np.arange(5, 12), colour_error=0.1, unlike=True)
-    assert _unlike(frames, t, 11, 0.1) and not _unlike(frames, t, 12, 0.1)  # 2 s after frame 4
+    assert not _is_appearance_outlier(frames, t, 1, 0.5)  # nothing is usual yet
+    assert not _is_appearance_outlier(frames, t, 5, 0.024) and _is_appearance_outlier(frames, t, 5, 0.026)
+    frames = frames.put(np.arange(5, 12), colour_error=0.1, appearance_outlier=True)
+    assert _is_appearance_outlier(frames, t, 11, 0.1) and not _is_appearance_outlier(
+        frames, t, 12, 0.1
+    )  # 2 s after frame 4
     frames = frames.put(12, colour_error=0.1)
-    assert not _unlike(frames, t, 13, 0.2) and _unlike(frames, t, 13, 0.26)
+    assert not _is_appearance_outlier(frames, t, 13, 0.2) and _is_appearance_outlier(frames, t, 13, 0.26)
     clean = no_frames(20).put(np.arange(1, 5), colour_error=0.001)
-    assert not _unlike(clean, t, 5, 0.019) and _unlike(clean, t, 5, 0.021)
+    assert not _is_appearance_outlier(clean, t, 5, 0.019) and _is_appearance_outlier(clean, t, 5, 0.021)
 
 
 def test_a_frame_looks_like_itself_in_another_light():
@@ -138,9 +142,9 @@ def test_a_camera_that_comes_back_is_recognised_without_an_imu(walk):
     assert result.lost[12:22].all() and not result.lost[:12].any() and not result.lost[22:].any()
     assert not result.mapped[12:23].any() and result.mapped[24:].any()  # the first found is not mapped yet
     assert result.uncertain[12:22].all()
-    truth = back.T_world_cam
-    assert truth is not None
-    error = np.linalg.norm(result.T_world_cam[23:, :3, 3] - truth[23:, :3, 3], axis=1)
+    ground_truth = back.T_world_cam
+    assert ground_truth is not None
+    error = np.linalg.norm(result.T_world_cam[23:, :3, 3] - ground_truth[23:, :3, 3], axis=1)
     assert np.sqrt(np.mean(error**2)) < 0.05  # without alignment: in the world of before
 
 
@@ -149,19 +153,19 @@ def test_an_imu_bridges_two_seconds_of_darkness(walk):
     result = run(blacked_out(walk, range(10, 20)), SlamConfig(imu="combined"))
     assert result.lost[10:20].all() and not result.lost[21:].any()
     assert result.uncertain[10:20].all() and result.mapped[20:].any()
-    truth = walk.T_world_cam
-    assert truth is not None
-    error = np.linalg.norm(result.T_world_cam[:, :3, 3] - truth[:, :3, 3], axis=1)
-    assert error.max() < 0.06 and trajectory_error.ate(result.T_world_cam, truth).rmse < 0.03
+    ground_truth = walk.T_world_cam
+    assert ground_truth is not None
+    error = np.linalg.norm(result.T_world_cam[:, :3, 3] - ground_truth[:, :3, 3], axis=1)
+    assert error.max() < 0.06 and trajectory_error.ate(result.T_world_cam, ground_truth).rmse < 0.03
 
 
 @pytest.mark.slow
 def test_without_true_poses_the_readings_find_their_gravity(walk):
-    truth = walk.T_world_cam
-    assert truth is not None
+    ground_truth = walk.T_world_cam
+    assert ground_truth is not None
     result = run(walk._replace(T_world_cam=None), SlamConfig(imu="combined"))
-    assert not result.lost.any() and trajectory_error.ate(result.T_world_cam, truth).rmse < 0.02
-    up = (result.T_world_cam @ np.linalg.inv(truth))[:, :3, 2]
+    assert not result.lost.any() and trajectory_error.ate(result.T_world_cam, ground_truth).rmse < 0.02
+    up = (result.T_world_cam @ np.linalg.inv(ground_truth))[:, :3, 2]
     assert (np.rad2deg(np.arccos(up[:, 2])) < 3).all()
 
 

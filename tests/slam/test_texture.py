@@ -10,7 +10,7 @@ from scipy.ndimage import map_coordinates
 from jaxpose.geometry.camera import Camera
 from jaxpose.scenes import GridConfig, grid, node_positions
 from jaxpose.slam.keyframes import Keyframe
-from jaxpose.slam.map.texture import _tiled, paint, painted
+from jaxpose.slam.map.texture import _tiled, make_texture, textured
 from jaxpose.slam.observation import Image
 
 CAMERA = Camera(200.0, 200.0, 79.5, 59.5, 160, 120)
@@ -42,19 +42,22 @@ def wall_values():
     )
 
 
-def seen_at(points, coat):
-    scene, params = painted(grid(GRID), GRID), (jnp.asarray(wall_values()), jax.tree.map(jnp.asarray, coat))
+def seen_at(points, texture):
+    scene, params = (
+        textured(grid(GRID), GRID),
+        (jnp.asarray(wall_values()), jax.tree.map(jnp.asarray, texture)),
+    )
     return jax.vmap(lambda p: scene.query(params, p, jnp.zeros(3)))(jnp.asarray(points, jnp.float32))
 
 
 def test_a_wall_is_painted_finer_than_the_cells():
-    coat = paint(GRID, wall_values()[..., 0], [keyframe(0, -0.05), keyframe(1, 0.05)], CAMERA)
+    texture = make_texture(GRID, wall_values()[..., 0], [keyframe(0, -0.05), keyframe(1, 0.05)], CAMERA)
     rng = np.random.default_rng(0)
     xy = rng.uniform([-0.25, -0.2], [0.25, 0.2], (300, 2))
-    distance, rgb = seen_at(np.column_stack([xy, np.full(300, WALL_Z)]), coat)
+    distance, rgb = seen_at(np.column_stack([xy, np.full(300, WALL_Z)]), texture)
     assert_allclose(distance, 0, atol=1e-6)
-    truth = picture(*xy.T)
-    off = np.sqrt(np.mean((np.asarray(rgb) - truth) ** 2, axis=0))
+    ground_truth = picture(*xy.T)
+    off = np.sqrt(np.mean((np.asarray(rgb) - ground_truth) ** 2, axis=0))
     # Linear between nodes 2 cm apart, a wave of 12 cm and height 0.4 is off by 0.03; 4 cm apart by 0.1.
     assert off[:2].max() < 0.04 and off[2] < 0.003
 
@@ -62,11 +65,11 @@ def test_a_wall_is_painted_finer_than_the_cells():
 def test_what_no_keyframe_saw_keeps_the_colour_of_the_map():
     away = np.diag([1.0, -1, -1, 1])
     for keyframes in ([], [keyframe(0, 0.0)._replace(T_world_cam=away)]):
-        coat = paint(GRID, wall_values()[..., 0], keyframes, CAMERA)
-        assert coat.tiles.shape[0] == 1 and not coat.tiles.any() and not coat.slot.any()
-    coat = paint(GRID, wall_values()[..., 0], [keyframe(0, 0.0)], CAMERA)
-    assert coat.slot.shape == (2, 2, 2) and set(np.unique(coat.tiles[..., 3])) == {0, 255}
-    _, rgb = seen_at([[0.0, 0.0, WALL_Z - 0.1], [0.0, 0.0, WALL_Z + 0.1]], coat)
+        texture = make_texture(GRID, wall_values()[..., 0], keyframes, CAMERA)
+        assert texture.tiles.shape[0] == 1 and not texture.tiles.any() and not texture.slot.any()
+    texture = make_texture(GRID, wall_values()[..., 0], [keyframe(0, 0.0)], CAMERA)
+    assert texture.slot.shape == (2, 2, 2) and set(np.unique(texture.tiles[..., 3])) == {0, 255}
+    _, rgb = seen_at([[0.0, 0.0, WALL_Z - 0.1], [0.0, 0.0, WALL_Z + 0.1]], texture)
     assert_allclose(rgb, 0.5, atol=1e-6)
 
 
@@ -74,7 +77,7 @@ def test_a_keyframe_that_sees_something_else_there_paints_nothing():
     """A table in front of the wall, which the map does not hold: its colour does not land on the wall."""
     nearer = keyframe(0, 0.0)
     nearer = nearer._replace(image=nearer.image._replace(depth=nearer.image.depth - 0.2))
-    assert not paint(GRID, wall_values()[..., 0], [nearer], CAMERA).tiles.any()
+    assert not make_texture(GRID, wall_values()[..., 0], [nearer], CAMERA).tiles.any()
 
 
 def test_tiles_hold_what_a_dense_array_would():
@@ -83,10 +86,10 @@ def test_tiles_hold_what_a_dense_array_would():
     dense = np.zeros((33, 25, 21, 4), np.uint8)
     chosen = rng.random((33, 25, 21)) < 0.9
     dense[chosen] = np.column_stack([rng.integers(0, 256, (chosen.sum(), 3)), np.full(chosen.sum(), 255)])
-    coat = _tiled(np.argwhere(chosen), dense[chosen], np.array([32, 24, 20]))
+    texture = _tiled(np.argwhere(chosen), dense[chosen], np.array([32, 24, 20]))
     cells = rng.uniform(0, [32, 24, 20], (200, 3))
     cells[:50] = np.round(cells[:50])
-    _, rgb = seen_at(np.array(GRID.lower) + cells * GRID.voxel / 2, coat)
+    _, rgb = seen_at(np.array(GRID.lower) + cells * GRID.voxel / 2, texture)
     read = [map_coordinates(dense[..., k].astype(float), cells.T, order=1) for k in range(4)]
     known = read[3] > 0.3 * 255
     assert_allclose(np.asarray(rgb)[known], np.stack(read[:3], -1)[known] / read[3][known, None], atol=2e-3)

@@ -4,12 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers.box import UPPER, box_pixels, inside_of_a_box
+from helpers.bounding_grid import UPPER, box_pixels, inside_of_a_box
 from scipy.spatial.transform import Rotation
 
 from jaxpose.datasets.types import Frame, Recording
 from jaxpose.errors import DataError
-from jaxpose.fields import PoseNetConfig, pin
+from jaxpose.fields import PoseNetConfig, project_onto_poses
 from jaxpose.geometry import se3
 from jaxpose.geometry.camera import Camera
 from jaxpose.imu import Imu
@@ -18,14 +18,14 @@ from jaxpose.slam.tracking.objective import TrackConfig
 from jaxpose.slam.tracking.predict import (
     GYRO_BIAS_SIGMA,
     end_velocity,
-    integrate,
-    no_readings,
+    no_imu,
     observe_acceleration,
     observe_gyro_bias,
     predict,
     prediction_sigma,
+    preintegrate,
 )
-from jaxpose.slam.tracking.reference_frames import gauge, make_field
+from jaxpose.slam.tracking.reference_frames import make_field, reference_frame
 from jaxpose.slam.tracking.register import align, best_start, starts, surface_residuals
 
 SMALL = PoseNetConfig(layers=3, width=32, activation="softplus")
@@ -37,12 +37,12 @@ def one_wall(point):
 
 
 def test_alignment_finds_the_camera_in_a_closed_form_room():
-    truth = np.asarray(se3.exp(jnp.array([0.1, -0.2, 0.3, 0.2, 0.1, -0.1])))
-    start = se3.compose(jnp.asarray(truth), se3.exp(jnp.array([0.08, -0.06, 0.05, 0.05, -0.04, 0.06])))
-    pixels, config = box_pixels(truth, 300), TrackConfig()
+    ground_truth = np.asarray(se3.exp(jnp.array([0.1, -0.2, 0.3, 0.2, 0.1, -0.1])))
+    start = se3.compose(jnp.asarray(ground_truth), se3.exp(jnp.array([0.08, -0.06, 0.05, 0.05, -0.04, 0.06])))
+    pixels, config = box_pixels(ground_truth, 300), TrackConfig()
     wide = jnp.array([0.5, 0.5])
     found = jax.jit(lambda T: align(inside_of_a_box, T, T, wide, pixels, config))(start)
-    error = se3.log(se3.compose(se3.inverse(found.T_world_cam), jnp.asarray(truth)))
+    error = se3.log(se3.compose(se3.inverse(found.T_world_cam), jnp.asarray(ground_truth)))
     assert jnp.linalg.norm(error[:3]) < 2e-4 and jnp.linalg.norm(error[3:]) < 2e-4
     assert found.iterations < config.iterations
     # The information is that of a minimum: positive definite.
@@ -79,9 +79,9 @@ def test_slopes_of_the_residuals_are_those_of_finite_differences():
 
 
 def test_an_image_that_is_darker_and_bluer_is_aligned_to_the_same_pose():
-    truth = np.asarray(se3.exp(jnp.array([0.1, -0.2, 0.3, 0.2, 0.1, -0.1])))
-    pixels, wide = box_pixels(truth, 300), jnp.array([0.5, 0.5])
-    start = se3.compose(jnp.asarray(truth), se3.exp(jnp.array([0.02, -0.01, 0.02, 0.01, -0.01, 0.02])))
+    ground_truth = np.asarray(se3.exp(jnp.array([0.1, -0.2, 0.3, 0.2, 0.1, -0.1])))
+    pixels, wide = box_pixels(ground_truth, 300), jnp.array([0.5, 0.5])
+    start = se3.compose(jnp.asarray(ground_truth), se3.exp(jnp.array([0.02, -0.01, 0.02, 0.01, -0.01, 0.02])))
     aligned = jax.jit(lambda pixels: align(one_wall, start, start, wide, pixels, TrackConfig()))
     bright = aligned(pixels)
     dark = aligned(pixels._replace(rgb=pixels.rgb * jnp.array([[0.5, 0.6, 0.8]])))
@@ -90,9 +90,9 @@ def test_an_image_that_is_darker_and_bluer_is_aligned_to_the_same_pose():
 
 
 def test_colour_finds_what_a_single_wall_does_not_say():
-    truth = np.eye(4)
+    ground_truth = np.eye(4)
     start = se3.exp(jnp.array([0.03, -0.02, 0.02, 0.01, 0.0, 0.02]))
-    pixels = box_pixels(truth, 300)
+    pixels = box_pixels(ground_truth, 300)
     ahead = jnp.abs(pixels.depth - UPPER[2]) < 1e-3
     pixels = jax.tree.map(lambda x: x[ahead], pixels)
     found = {
@@ -106,46 +106,50 @@ def test_colour_finds_what_a_single_wall_does_not_say():
 
 
 def test_a_sharp_prediction_holds_the_pose_against_the_image():
-    truth = np.eye(4)
+    ground_truth = np.eye(4)
     start = se3.exp(jnp.array([0.03, 0.0, 0.0, 0.0, 0.0, 0.0]))
     sharp = jnp.array([1e-6, 1e-6])
-    run_align = jax.jit(lambda T: align(inside_of_a_box, T, T, sharp, box_pixels(truth, 300), TrackConfig()))
+    run_align = jax.jit(
+        lambda T: align(inside_of_a_box, T, T, sharp, box_pixels(ground_truth, 300), TrackConfig())
+    )
     assert jnp.abs(run_align(start).T_world_cam - start).max() < 1e-4
 
 
 def test_the_best_start_is_the_one_that_explains_the_image():
-    truth = np.asarray(se3.exp(jnp.array([0.1, 0.0, 0.1, 0.0, 0.1, 0.0])))
-    tries = starts(jnp.asarray(truth), jnp.array([0.1, 0.1]))
+    ground_truth = np.asarray(se3.exp(jnp.array([0.1, 0.0, 0.1, 0.0, 0.1, 0.0])))
+    tries = starts(jnp.asarray(ground_truth), jnp.array([0.1, 0.1]))
     assert tries.shape == (13, 4, 4)
     order = jnp.roll(tries, 5, axis=0)
-    chosen = best_start(inside_of_a_box, order, box_pixels(truth, 300))
-    assert jnp.array_equal(chosen, jnp.asarray(truth))
+    chosen = best_start(inside_of_a_box, order, box_pixels(ground_truth, 300))
+    assert jnp.array_equal(chosen, jnp.asarray(ground_truth))
 
 
 @pytest.mark.parametrize("name", ["anchored", "default", "world", "intrinsic"])
 def test_a_field_is_pinned_to_poses_from_frame_to_frame(name):
     framed = make_field(name, SMALL, 0.2, 10.0)
     params = framed.field.init(jax.random.key(0))
-    stamps = jnp.array([0.2, 0.0, -0.2])
+    timestamps = jnp.array([0.2, 0.0, -0.2])
     rng = np.random.default_rng(1)
     step = jax.jit(
-        lambda params, poses, g: pin(lambda p: jax.vmap(framed.direct(p, g))(stamps), params, poses, steps=8)
+        lambda params, poses, g: project_onto_poses(
+            lambda p: jax.vmap(framed.direct(p, g))(timestamps), params, poses, steps=8
+        )
     )
     twist = np.zeros(6)
     for i in range(4):
         twist = 0.8 * twist + 0.02 * rng.normal(size=6)
-        poses = se3.exp(jnp.asarray(np.asarray(stamps)[:, None] / 0.2 * twist, jnp.float32))
-        where = gauge(name, 1 + 0.2 * i, np.eye(4), np.eye(4), rng)
+        poses = se3.exp(jnp.asarray(np.asarray(timestamps)[:, None] / 0.2 * twist, jnp.float32))
+        where = reference_frame(name, 1 + 0.2 * i, np.eye(4), np.eye(4), rng)
         params = step(params, poses, where)
-        found = jax.vmap(framed.motion(params, where))(stamps)
+        found = jax.vmap(framed.motion(params, where))(timestamps)
         assert jnp.abs(found - poses).max() < 1e-3
 
 
 def constant_readings(omega, force, t=0.5, rate=200):
-    stamps = jnp.arange(0, t + 1e-9, 1 / rate, dtype=jnp.float32)
-    n = stamps.shape[0]
+    timestamps = jnp.arange(0, t + 1e-9, 1 / rate, dtype=jnp.float32)
+    n = timestamps.shape[0]
     imu = Imu(
-        stamps,
+        timestamps,
         jnp.tile(jnp.asarray(omega, jnp.float32), (n, 1)),
         jnp.tile(jnp.asarray(force, jnp.float32), (n, 1)),
     )
@@ -156,9 +160,9 @@ def test_prediction_from_inertial_readings_is_the_closed_form_motion():
     # Turning about gravity and pushed along the body's x by 1 m/s^2 from 0.3 m/s.
     rate, push, speed, t = 0.8, 1.0, 0.3, 0.5
     imu, mask = constant_readings([0, 0, rate], [push, 0, 9.80665], t)
-    readings = integrate(imu, mask, jnp.eye(3), jnp.array([0.0, 0.0, -9.80665]))
-    stamps, poses = predict(t, np.zeros(6), np.array([speed, 0, 0]), readings, rotation=True, speed=True)
-    assert stamps[-1] == pytest.approx(t, abs=1e-6)
+    readings = preintegrate(imu, mask, jnp.eye(3), jnp.array([0.0, 0.0, -9.80665]))
+    timestamps, poses = predict(t, np.zeros(6), np.array([speed, 0, 0]), readings, rotation=True, speed=True)
+    assert timestamps[-1] == pytest.approx(t, abs=1e-6)
     np.testing.assert_allclose(
         poses[-1][:3, :3], Rotation.from_rotvec([0, 0, rate * t]).as_matrix(), atol=1e-5
     )
@@ -173,11 +177,11 @@ def test_prediction_from_inertial_readings_is_the_closed_form_motion():
 
 def test_prediction_without_readings_is_the_last_motion_again():
     twist = np.array([0.1, 0.2, -0.1, 0.3, 0.0, 0.2])
-    stamps, poses = predict(0.5, twist, np.zeros(3), no_readings(), rotation=True, speed=True)
+    timestamps, poses = predict(0.5, twist, np.zeros(3), no_imu(), rotation=True, speed=True)
     np.testing.assert_allclose(
         poses[-1], np.asarray(se3.exp(jnp.asarray(0.5 * twist, jnp.float32))), atol=1e-6
     )
-    assert len(stamps) == len(poses)
+    assert len(timestamps) == len(poses)
 
 
 def test_a_false_acceleration_is_found_from_the_errors_of_predictions():

@@ -9,7 +9,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from jaxpose import fields, scenes
-from jaxpose.events import Events, Streams, by_pixel, log_intensity, mosaic_mask, simulate
+from jaxpose.events import Events, PixelIndex, index_by_pixel, log_intensity, mosaic_mask, simulate
 from jaxpose.fields import PoseField
 from jaxpose.geometry import se3
 from jaxpose.geometry.camera import Camera
@@ -34,8 +34,8 @@ def events() -> Events:
     return simulate(zip(0.1 * np.arange(31), values, strict=True), 0.2)
 
 
-def on_device(streams: Streams) -> Streams:
-    return Streams(*(jnp.asarray(x, jnp.float32 if x.dtype == float else jnp.int32) for x in streams))
+def on_device(streams: PixelIndex) -> PixelIndex:
+    return PixelIndex(*(jnp.asarray(x, jnp.float32 if x.dtype == float else jnp.int32) for x in streams))
 
 
 def counted(events: Events, pixel, after, until):
@@ -50,7 +50,7 @@ def counted(events: Events, pixel, after, until):
 
 def test_a_window_compares_changed_pixels_and_some_of_all_at_the_same_two_instants(events):
     config = EventTrainConfig(events=200, negatives=0.25, longest_s=0.4)
-    streams = on_device(by_pixel(events, HEIGHT, WIDTH))
+    streams = on_device(index_by_pixel(events, HEIGHT, WIDTH))
     draw = jax.jit(partial(window_pairs, span=SPAN, config=config))
     lengths = []
     for seed in range(5):
@@ -70,15 +70,15 @@ def test_a_window_compares_changed_pixels_and_some_of_all_at_the_same_two_instan
 
 def test_asynchronous_pairs_are_events_of_one_pixel_at_their_own_times(events):
     config = EventTrainConfig(events=1000, negatives=0.25, longest_s=0.5, back=3)
-    streams = by_pixel(events, HEIGHT, WIDTH)
+    streams = index_by_pixel(events, HEIGHT, WIDTH)
     pairs = jax.device_get(asynchronous_pairs(jax.random.key(0), on_device(streams), SPAN, config))
     assert_array_equal(pairs.change, counted(events, pairs.pixel, pairs.t_before, pairs.t_now))
     positive = jax.tree.map(lambda x: x[:750], pairs)
-    stamps = {(int(p), float(np.float32(t))) for p, t in zip(streams.pixel, streams.t, strict=True)}
+    timestamps = {(int(p), float(np.float32(t))) for p, t in zip(streams.pixel, streams.t, strict=True)}
     used = positive.weight > 0
     assert used.mean() > 0.8
     for pixel, now, before in zip(positive.pixel, positive.t_now, positive.t_before, strict=True):
-        assert (int(pixel), float(now)) in stamps and (int(pixel), float(before)) in stamps
+        assert (int(pixel), float(now)) in timestamps and (int(pixel), float(before)) in timestamps
     between = [
         ((streams.pixel == p) & (np.float32(streams.t) > a) & (np.float32(streams.t) <= b)).sum()
         for p, a, b in zip(positive.pixel, positive.t_before, positive.t_now, strict=True)
@@ -121,7 +121,7 @@ def seen():
             yield t, log_intensity((np.asarray(rgb, np.float64) * mask).sum(-1))
 
     events = simulate(images(), 0.02)
-    data = EventData(on_device(by_pixel(events, HEIGHT, WIDTH)), jnp.asarray(mask.reshape(-1, 3)))
+    data = EventData(on_device(index_by_pixel(events, HEIGHT, WIDTH)), jnp.asarray(mask.reshape(-1, 3)))
     return scene, depths, data, background
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from jaxpose.training.steps import sum_by_chunks
+from jaxpose.training.steps import microbatched_sum
 
 ITEMS = 11
 RTOL = {jnp.float32: 2e-5, jnp.float64: 1e-12}
@@ -31,7 +31,7 @@ def plain(params, shift, batch):
 
 
 def chunked(chunk):
-    total = sum_by_chunks(loss, chunk)
+    total = microbatched_sum(loss, chunk)
     return lambda params, shift, batch: 3 * total(params, batch | {"x": jnp.sin(batch["x"] + shift[None])})
 
 
@@ -56,7 +56,7 @@ def test_items_with_random_keys():
     keys = jax.random.split(jax.random.key(0), 6)
     noise = np.stack([jax.random.normal(key, (2,)) for key in jax.random.split(jax.random.key(0), 6)])
     x = jnp.asarray(np.random.default_rng(0).normal(size=(6, 2)), jnp.float32)
-    gradient = jax.grad(lambda x: sum_by_chunks(noisy, 3)(jnp.float32(2), (x, keys)))(x)
+    gradient = jax.grad(lambda x: microbatched_sum(noisy, 3)(jnp.float32(2), (x, keys)))(x)
     assert_allclose(gradient, 2 * noise, rtol=1e-6)
 
 
@@ -73,7 +73,7 @@ def test_the_network_is_traced_once_and_the_value_alone_takes_no_gradient():
         return x, ()
 
     watched.defvjp(forward, lambda _, cotangent: (cotangent,))
-    total = sum_by_chunks(lambda params, x: watched(params * x), 2)
+    total = microbatched_sum(lambda params, x: watched(params * x), 2)
     x = jnp.ones(6)
     assert jax.jit(total)(jnp.ones(()), x) == 6
     jax.effects_barrier()
@@ -88,4 +88,4 @@ def test_the_network_is_traced_once_and_the_value_alone_takes_no_gradient():
 
 def test_wrong_chunk():
     with pytest.raises(ValueError, match="chunk: expected at least 1 item, got 0"):
-        sum_by_chunks(loss, 0)
+        microbatched_sum(loss, 0)

@@ -70,19 +70,19 @@ def test_a_view_is_the_sum_along_every_ray():
 @pytest.mark.slow
 def test_noisy_poses_are_found_again():
     """The scene known, poses off by 0.1 and 6 degrees: PoseNet brings them back, on either side."""
-    truth = np.asarray(around(T), np.float64)
+    ground_truth = np.asarray(around(T), np.float64)
     off = np.asarray(se3.exp(jnp.stack([0.1 * jnp.cos(3 * T), 0.1 * T, 0 * T, 0.1 * T, 0 * T, 0.1 * T], -1)))
-    for side, start in (("world", off @ truth), ("body", truth @ off)):
+    for side, start in (("world", off @ ground_truth), ("body", ground_truth @ off)):
         net = fields.posenet(fields.PoseNetConfig(octaves=2, layers=3, width=32))
-        field = fields.refine(net, fields.stamped(T, jnp.asarray(start, jnp.float32)), side=side)
+        field = fields.refine(net, fields.piecewise_geodesic(T, jnp.asarray(start, jnp.float32)), side=side)
         rates = {"translation": Rate(1e-3, 1e-4), "rotation": Rate(1e-3, 1e-4)}
         config = TrainConfig(steps=400, rays=128, samples=48, chunk=64)
         trainer = photometric.trainer(ball_scene(), field, CAMERA, DEPTHS, Rate(0.0, 0.0), rates, config)
         state, losses = trainer.advance(trainer.start(jax.random.key(0)), views(), 400)
         found = np.asarray(jax.vmap(field.pose, (None, 0))(state.pose, T), np.float64)
-        before = np.linalg.norm(start[:, :3, 3] - truth[:, :3, 3], axis=-1).mean()
-        after = np.linalg.norm(found[:, :3, 3] - truth[:, :3, 3], axis=-1).mean()
-        angles = rigid.rotation_angle_deg(found[:, :3, :3], truth[:, :3, :3])
+        before = np.linalg.norm(start[:, :3, 3] - ground_truth[:, :3, 3], axis=-1).mean()
+        after = np.linalg.norm(found[:, :3, 3] - ground_truth[:, :3, 3], axis=-1).mean()
+        angles = rigid.rotation_angle_deg(found[:, :3, :3], ground_truth[:, :3, :3])
         assert before > 0.09 and after < 0.5 * before and angles.mean() < 1.2, (side, before, after, angles)
         assert losses[-30:].mean() < 0.2 * losses[:30].mean()
         assert int(state.step) == 400
@@ -91,7 +91,7 @@ def test_noisy_poses_are_found_again():
 def test_the_loss_is_the_mean_squared_colour_error():
     """Every ray of a one-pixel camera is the same ray, so the loss of a step is known without its draws."""
     pixel = Camera(20.0, 20.0, 0.0, 0.0, 1, 1)
-    field = fields.refine(fields.table(T), fields.stamped(T, around(T)))
+    field = fields.refine(fields.table(T), fields.piecewise_geodesic(T, around(T)))
     config = TrainConfig(steps=10, rays=6, samples=400, chunk=4)
     trainer = photometric.trainer(ball_scene(), field, pixel, DEPTHS, Rate(0.0, 0.0), Rate(0.0, 0.0), config)
     grey = Views(T, jnp.full((5, 1, 1, 3), 51, jnp.uint8))
@@ -104,7 +104,7 @@ def test_the_loss_is_the_mean_squared_colour_error():
 
 def test_rates_fall_and_groups_wait():
     """Adam's first step has the length of its rate, whatever the gradient; a waiting group does not move."""
-    field = fields.refine(fields.table(T), fields.stamped(T, around(T)))
+    field = fields.refine(fields.table(T), fields.piecewise_geodesic(T, around(T)))
     waits = Rate(np.full((1, 6), 1e-2), 1e-4, np.array([[0.0] * 3 + [0.5] * 3]))
     config = TrainConfig(steps=4, rays=64, samples=8, chunk=64)
     trainer = photometric.trainer(
@@ -137,7 +137,7 @@ def test_windows_follow_the_steps():
 
 def test_steps_are_the_same_in_one_call_or_many_and_never_recompile():
     chex.clear_trace_counter()
-    field = fields.refine(fields.table(T), fields.stamped(T, around(T)))
+    field = fields.refine(fields.table(T), fields.piecewise_geodesic(T, around(T)))
     counted = field._replace(pose=chex.assert_max_traces(field.pose, n=4))
     config = TrainConfig(steps=8, rays=16, samples=8, chunk=16)
     trainer = photometric.trainer(
@@ -156,11 +156,11 @@ def test_a_held_out_pose_settles():
     look = photometric.viewer(
         ball_scene(), CAMERA, DEPTHS, TrainConfig(rays=128, samples=32, chunk=64), settle_rate=3e-3
     )
-    truth = around(T)[2]
-    rgb = jnp.asarray(np.round(255 * photographs(truth[None])[0]), jnp.uint8)
-    start = se3.compose(se3.exp(jnp.asarray([0.05, -0.05, 0.0, 0.03, 0.0, 0.02])), truth)
+    ground_truth = around(T)[2]
+    rgb = jnp.asarray(np.round(255 * photographs(ground_truth[None])[0]), jnp.uint8)
+    start = se3.compose(se3.exp(jnp.asarray([0.05, -0.05, 0.0, 0.03, 0.0, 0.02])), ground_truth)
     moved = look.settle({"centre": jnp.zeros(3)}, start, rgb, jax.random.key(0))
-    off = lambda pose: float(jnp.linalg.norm(se3.log(se3.compose(se3.inverse(truth), pose))))
+    off = lambda pose: float(jnp.linalg.norm(se3.log(se3.compose(se3.inverse(ground_truth), pose))))
     assert off(moved) < 0.5 * off(start)
 
 
@@ -173,7 +173,7 @@ def test_sizes_that_mean_nothing(setting):
 def test_refinement_on_either_side():
     field = fields.table(T)
     params = jnp.asarray(np.random.default_rng(0).normal(size=(5, 6)), jnp.float32)
-    initial = fields.stamped(T, around(T))
+    initial = fields.piecewise_geodesic(T, around(T))
     moves, starts = (jax.vmap(partial(f))(T) for f in (partial(field.pose, params), initial))
     for side, expected in (("body", starts @ moves), ("world", moves @ starts)):
         refined = fields.refine(field, initial, side=side)

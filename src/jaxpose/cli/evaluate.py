@@ -1,8 +1,8 @@
 """How far an estimated trajectory is from a reference: ATE, RPE and rotation error, with their protocol.
 
 ESTIMATE and REFERENCE are trajectory files (TUM, KITTI, EuRoC or TUM-VI csv, lists of 4x4 matrices: found by
-their content) or run folders of this package. Poses are paired by nearest stamp, or row by row where a format
-has no stamps; a run's continuous trajectory is asked at the reference's own stamps.
+their content) or run folders of this package. Poses are paired by nearest timestamp, or row by row where a
+format has no timestamps; a run's continuous trajectory is asked at the reference's own timestamps.
 """
 
 import math
@@ -36,15 +36,15 @@ class Config:
     """Settings of a comparison; the two trajectories and these are all that the numbers depend on."""
 
     estimate: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="ESTIMATE")]  # file or run folder
-    # The truth, or what is taken for it: file or run folder.
+    # The ground truth, or what is taken for it: file or run folder.
     reference: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="REFERENCE")]
     align: Alignment = "se3"  # how the estimate is moved onto the reference first
     # nearest: each pose of the shorter trajectory with the nearest in time of the other; exact: the
-    # continuous trajectory of the estimate at the reference's stamps; auto: exact if the estimate is a run
-    # that has one.
+    # continuous trajectory of the estimate at the reference's timestamps; auto: exact if the estimate is a
+    # run that has one.
     match: Literal["auto", "nearest", "exact"] = "auto"
-    max_difference: float = 0.01  # [s] largest distance of two stamps that are paired as nearest
-    time_offset: float = 0.0  # [s] added to the stamps of the estimate
+    max_difference: float = 0.01  # [s] largest distance of two timestamps that are paired as nearest
+    time_offset: float = 0.0  # [s] added to the timestamps of the estimate
     rpe_frames: tuple[int, ...] = (1,)  # relative errors over so many poses
     rpe_seconds: tuple[float, ...] = (1.0,)  # relative errors over so much time [s]
     rpe_metres: tuple[float, ...] = ()  # relative errors over so much of the reference's path [m]
@@ -91,7 +91,7 @@ class Result(NamedTuple):
 
 
 class _Pairs(NamedTuple):
-    """Poses row by row, at the reference's stamps."""
+    """Poses row by row, at the reference's timestamps."""
 
     t: Float[np.ndarray, " n"]
     estimate: Float[np.ndarray, "n 4 4"]
@@ -180,37 +180,40 @@ def _pair(config: Config, estimate: Source, reference: Source) -> _Pairs:
         if len(t_estimate) != len(t_reference):
             raise DataError(
                 f"{estimate.path}: expected {len(t_reference)} poses, as {reference.path} has, to pair them "
-                f"row by row (one of the two has no stamps), got {len(t_estimate)}"
+                f"row by row (one of the two has no timestamps), got {len(t_estimate)}"
             )
         t = t_reference if reference.stamped else t_estimate + config.time_offset
         stamped = reference.stamped or estimate.stamped
-        return _Pairs(t, T_estimate, T_reference, "row by row, as not both have stamps", stamped)
+        return _Pairs(t, T_estimate, T_reference, "row by row, as not both have timestamps", stamped)
     # Reference first: of two equally long ones each pose of the estimate takes its nearest, as evo does.
     of_reference, of_estimate = trajectories.associate(
         t_reference, t_estimate + config.time_offset, config.max_difference
     )
     fewer = min(len(t_reference), len(t_estimate))
-    how = f"of {fewer} poses of the shorter one: nearest stamps, at most {config.max_difference:g} s apart"
+    how = (
+        f"of {fewer} poses of the shorter one: nearest timestamps, at most {config.max_difference:g} s apart"
+    )
     how += f"; the estimate's moved by {config.time_offset:g} s" if config.time_offset else ""
     return _Pairs(t_reference[of_reference], T_estimate[of_estimate], T_reference[of_reference], how, True)
 
 
 def _exact(config: Config, estimate: Source, reference: Source) -> _Pairs:
-    """The estimate's continuous trajectory at the reference's stamps, as far as it goes."""
+    """The estimate's continuous trajectory at the reference's timestamps, as far as it goes."""
     pose = read_field(estimate)
     if not reference.stamped:
-        raise DataError(f"{reference.path}: expected stamps for --match exact, got a {reference.what}")
+        raise DataError(f"{reference.path}: expected timestamps for --match exact, got a {reference.what}")
     first, last = estimate.trajectory.t[[0, -1]]
     t = reference.trajectory.t - config.time_offset
     inside = (t >= first) & (t <= last)
     if not inside.any():
         raise DataError(
-            f"{reference.path}: expected stamps from {first:.3f} to {last:.3f} s, as {estimate.path} has, "
+            f"{reference.path}: expected timestamps from {first:.3f} to {last:.3f} s, as "
+            f"{estimate.path} has, "
             f"got {t[0]:.3f} to {t[-1]:.3f} s; --time-offset brings them to one clock"
         )
     outside = len(t) - int(inside.sum())
-    how = f"exact: the continuous trajectory ({FIELD}) at the reference's stamps"
-    how += f"; {outside} stamps of the reference beyond its ends are left out" if outside else ""
+    how = f"exact: the continuous trajectory ({FIELD}) at the reference's timestamps"
+    how += f"; {outside} timestamps of the reference beyond its ends are left out" if outside else ""
     how += f"; the estimate's clock moved by {config.time_offset:g} s" if config.time_offset else ""
     return _Pairs(reference.trajectory.t[inside], pose(t[inside]), reference.trajectory.T[inside], how, True)
 
@@ -223,7 +226,7 @@ def _relative(config: Config, pairs: _Pairs) -> tuple[tuple[Relative, ...], tupl
     asked.extend(("m", delta) for delta in config.rpe_metres)
     found, notes = [], []
     if config.rpe_seconds and not pairs.stamped:
-        notes.append("no stamps, so no RPE over seconds")
+        notes.append("no timestamps, so no RPE over seconds")
     for unit, delta in asked:
         try:
             rpe = trajectory_error.rpe(

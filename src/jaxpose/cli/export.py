@@ -2,7 +2,7 @@
 
 RUN is the folder of a run, or a trajectory file (to change its format). Poses are camera-to-world with camera
 axes right, down, forward, in the world of the run's trajectory.txt. They are those of the frames, or of the
-run's continuous trajectory at --rate-hz or at the stamps of a file (--at).
+run's continuous trajectory at --rate-hz or at the timestamps of a file (--at).
 """
 
 import os
@@ -22,7 +22,9 @@ if TYPE_CHECKING:
     from jaxpose.geometry.camera import Camera
 
 Format = Literal["tum", "kitti", "euroc", "transforms", "colmap", "npz"]
-_OWN = 1e-6  # [s] stamps of a file closer than this are the same: float64 holds those since 1970 to 2.4e-7
+_OWN = (
+    1e-6  # [s] timestamps of a file closer than this are the same: float64 holds those since 1970 to 2.4e-7
+)
 
 
 @dataclass(frozen=True)
@@ -30,13 +32,13 @@ class Config:
     """What to take out of a run, and where to put it."""
 
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]  # folder, or trajectory file
-    # tum: `t tx ty tz qx qy qz qw`; kitti: 3x4 matrices without stamps; euroc: csv with stamps in ns;
+    # tum: `t tx ty tz qx qy qz qw`; kitti: 3x4 matrices without timestamps; euroc: csv with timestamps in ns;
     # transforms: transforms.json for nerfstudio and instant-ngp; colmap: a text model; npz: the continuous
     # trajectory itself, which jaxpose/numpy_field.py evaluates with numpy alone.
     format: Format
     out: Path  # file to write; colmap: folder
     rate_hz: float | None = None  # poses so often from the first frame on, not at the frames
-    at: Path | None = None  # poses at the stamps of this file, the first number of each line ([s], or ns)
+    at: Path | None = None  # poses at the timestamps of this file, the first number of each line ([s], or ns)
     json: bool = False  # print what was written as JSON and nothing else
 
     def __post_init__(self):
@@ -70,7 +72,9 @@ def run(config: Config) -> Result:
         return _continuous(config, source)
     trajectory, times, notes = _chosen(config, source)
     if not source.stamped and config.format in ("tum", "euroc"):
-        raise DataError(f"{source.path}: expected stamps for --format {config.format}, got a {source.what}")
+        raise DataError(
+            f"{source.path}: expected timestamps for --format {config.format}, got a {source.what}"
+        )
     config.out.parent.mkdir(parents=True, exist_ok=True)
     if config.format == "tum":
         trajectories.write_tum(config.out, trajectory)
@@ -78,7 +82,7 @@ def run(config: Config) -> Result:
         trajectories.write_euroc(config.out, trajectory)
     elif config.format == "kitti":
         trajectories.write_kitti(config.out, trajectory.T)
-        notes += ("the format has no stamps: line i is pose i",)
+        notes += ("the format has no timestamps: line i is pose i",)
     else:
         notes += _with_images(config, source, trajectory)
     return Result(str(source), config.out, config.format, len(trajectory.t), times, notes)
@@ -108,7 +112,8 @@ def _chosen(config: Config, source: Source) -> tuple[trajectories.Trajectory, st
         strange = np.flatnonzero(~(np.abs(t[rows] - asked) < _OWN)) if source.stamped else np.arange(1)
         if len(strange):
             raise DataError(
-                f"{config.at}: expected stamps of {source.path}, as its motion between them is not known, "
+                f"{config.at}: expected timestamps of {source.path}, as its motion between them is not "
+                f"known, "
                 f"got {asked[strange[0]]:.6f} s"
             )
         return trajectories.Trajectory(asked, T[rows]), f"those of {config.at}", ()
@@ -116,11 +121,11 @@ def _chosen(config: Config, source: Source) -> tuple[trajectories.Trajectory, st
     inside = (asked >= t[0]) & (asked <= t[-1])
     if not inside.any():
         raise DataError(
-            f"{config.at}: expected stamps from {t[0]:.3f} to {t[-1]:.3f} s, as the run has, got "
+            f"{config.at}: expected timestamps from {t[0]:.3f} to {t[-1]:.3f} s, as the run has, got "
             f"{asked[0]:.3f} to {asked[-1]:.3f} s"
         )
     left = len(asked) - int(inside.sum())
-    notes = (f"{left} of {len(asked)} stamps are beyond the ends of the run: left out",) if left else ()
+    notes = (f"{left} of {len(asked)} timestamps are beyond the ends of the run: left out",) if left else ()
     asked = asked[inside]
     return (
         trajectories.Trajectory(asked, pose(asked)),

@@ -27,7 +27,7 @@ class Source(NamedTuple):
 
     def __str__(self) -> str:
         t = self.trajectory.t
-        span = f", {t[0]:.3f} to {t[-1]:.3f} s" if self.stamped else ", no stamps"
+        span = f", {t[0]:.3f} to {t[-1]:.3f} s" if self.stamped else ", no timestamps"
         return f"{self.path}  {self.what}, {len(t)} poses{span}"
 
 
@@ -37,7 +37,7 @@ def read_source(path: Path) -> Source:
         if not path.exists():
             raise DataError(f"{path}: expected a trajectory file or a run folder, got nothing")
         trajectory, name, stamped, repeated = trajectory_reader.read_trajectory(path)
-        what = f"{name} file" + (f" ({repeated} left out: same stamp as before)" if repeated else "")
+        what = f"{name} file" + (f" ({repeated} left out: same timestamp as before)" if repeated else "")
         return Source(path, what, trajectory, stamped, False)
     file = path / "trajectory.txt"
     if not file.is_file():
@@ -54,7 +54,7 @@ def read_field(source: Source) -> Callable[[Float[np.ndarray, " n"]], Float[np.n
     if not source.is_run:
         raise DataError(
             f"{source.path}: expected a run folder with {FIELD}, got a {source.what}: how it moved between "
-            "its stamps is not known"
+            "its timestamps is not known"
         )
     file = source.path / FIELD
     if not file.is_file():

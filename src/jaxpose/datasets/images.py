@@ -109,7 +109,7 @@ def read_matrix(file: Path, size: int) -> Float[np.ndarray, "{size} {size}"]:
     return rows
 
 
-def beside(folder: Path, name: str) -> Path | None:
+def sidecar(folder: Path, name: str) -> Path | None:
     """The file `name` in the folder, else the one beside it (one folder up), else None."""
     for file in (folder / name, folder.resolve().parent / name):
         if file.is_file():
@@ -136,7 +136,7 @@ def check_intrinsics(file: Path, K: Float[np.ndarray, "r r"], size: tuple[int, i
     return Pinhole(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
 
 
-def published(pinhole: Pinhole, size: tuple[int, int], of: tuple[int, int], without: str) -> str:
+def default_intrinsics(pinhole: Pinhole, size: tuple[int, int], of: tuple[int, int], without: str) -> str:
     """The note on intrinsics that were taken for lack of a file: as published, for images of size `of`."""
     note = f"no {without}: took the published fx fy cx cy = {' '.join(f'{number:g}' for number in pinhole)}"
     if size != of:
@@ -145,7 +145,7 @@ def published(pinhole: Pinhole, size: tuple[int, int], of: tuple[int, int], with
 
 
 def frame_times(numbers: Sequence[int], rate_hz: float) -> Float[np.ndarray, " n"]:
-    """Seconds since the first of frames that have numbers but no stamps; ValueError for a bad rate."""
+    """Seconds since the first of frames that have numbers but no timestamps; ValueError for a bad rate."""
     if not 0 < rate_hz < math.inf:
         raise ValueError(f"rate_hz: expected a positive rate, got {rate_hz}")
     return (np.asarray(numbers) - numbers[0]) / rate_hz
@@ -163,7 +163,9 @@ def check_positive(name: str, value: float) -> None:
 def usable_poses(
     T_world_cam: Float[np.ndarray, "n 4 4"], names: Sequence[str], where: Callable[[int], str], lack: str
 ) -> tuple[Float[np.ndarray, "n 4 4"] | None, tuple[str, ...]]:
-    """Truth with proper rotations, rows of NaN where it is not finite; None if there is no pose at all.
+    """Ground truth with proper rotations, rows of NaN where it is not finite.
+
+    None if there is no pose at all.
 
     `names` are the frames' for the notes, `where(i)` names the source of pose i in a DataError for what is no
     rigid transform, and `lack` says why a pose may be missing.
@@ -171,7 +173,7 @@ def usable_poses(
     poses = np.full(T_world_cam.shape, np.nan)
     finite = np.isfinite(T_world_cam).all((1, 2))
     if not finite.any():
-        return None, ("no usable poses: there is no truth to compare with",)
+        return None, ("no usable poses: there is no ground truth to compare with",)
     repaired = []
     for i in map(int, np.flatnonzero(finite)):
         pose = T_world_cam[i]

@@ -33,7 +33,7 @@ class Recording(NamedTuple):
     camera: Camera
     t: np.ndarray  # (n,) seconds since the first frame
     read: Callable[[int], Frame]
-    T_world_cam: np.ndarray | None = None  # (n, 4, 4) truth, rows of NaN where it is missing
+    T_world_cam: np.ndarray | None = None  # (n, 4, 4) ground truth, rows of NaN where it is missing
     imu: Imu | None = None  # on the clock of `t`
     T_body_cam: np.ndarray = np.eye(4)  # body = IMU
     gravity_world: np.ndarray = np.array(GRAVITY_WORLD)  # in the frame of `T_world_cam`
@@ -48,7 +48,7 @@ class Photographs(NamedTuple):
 
     name: str
     camera: Camera
-    t: Float[np.ndarray, " n"]  # [s], or the frame index where there are no stamps, as `notes` then says
+    t: Float[np.ndarray, " n"]  # [s], or the frame index where there are no timestamps, as `notes` then says
     rgb: UInt8[np.ndarray, "n h w 3"]  # on white where the file had alpha
     T_world_cam: Float[np.ndarray, "n 4 4"]  # float64, finite
     near: float  # depth along the optical axis at which the scene begins and ends [scene units]

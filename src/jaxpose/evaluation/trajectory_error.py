@@ -1,4 +1,4 @@
-"""How far an estimate is from the truth: alignment, trajectory errors, image error. numpy, float64.
+"""How far an estimate is from the ground truth: alignment, trajectory errors, image error. numpy, float64.
 
 Poses are camera-to-world (or body-to-world) matrices, matched row by row. Rows with a NaN or an infinity in
 either input carry no information: they are left out and counted, never an error by themselves.
@@ -142,9 +142,9 @@ def rpe(
 ) -> Rpe:
     """Relative pose error over every pair of frames (i, i + delta), overlapping pairs included.
 
-    With `along`, a number for each row that never decreases, such as its stamp or the path travelled until
-    then (`path_length`), row i is paired with the later row whose number is nearest to along[i] + delta, if
-    that is at most a tenth of `delta` off.
+    With `along`, a number for each row that never decreases, such as its timestamp or the path travelled
+    until then (`path_length`), row i is paired with the later row whose number is nearest to along[i] +
+    delta, if that is at most a tenth of `delta` off.
 
     Motions relative to a frame are free of any rigid alignment, so "none" and "se3" agree; "sim3" scales the
     estimate first. ValueError for `delta` below 1 frame or not positive, DataError without a usable pair.
@@ -163,12 +163,12 @@ def rpe(
         raise DataError(
             f"relative pose error: expected two finite poses {delta:g} {apart}, got {len(estimate)} poses"
         )
-    moved, truth = (_relative(T[first[used]], T[last[used]]) for T in (estimate, reference))
+    moved, ground_truth = (_relative(T[first[used]], T[last[used]]) for T in (estimate, reference))
     moved[:, :3, 3] *= scale
     translation, rotation = np.full((2, len(used)), np.nan)
     # The error's translation is this difference turned into the reference's last frame: of the same length.
-    translation[used] = np.linalg.norm(moved[:, :3, 3] - truth[:, :3, 3], axis=-1)
-    rotation[used] = rotation_angle_deg(moved[:, :3, :3], truth[:, :3, :3])
+    translation[used] = np.linalg.norm(moved[:, :3, 3] - ground_truth[:, :3, 3], axis=-1)
+    rotation[used] = rotation_angle_deg(moved[:, :3, :3], ground_truth[:, :3, :3])
     pairs = int(used.sum())
     return Rpe(statistics(translation), statistics(rotation), translation, rotation, pairs, len(used) - pairs)
 
@@ -214,12 +214,12 @@ def pose_errors(estimate: Float[np.ndarray, "n 4 4"], reference: Float[np.ndarra
     """
     alignment = procrustes(estimate, reference)
     used = _usable(estimate, reference)
-    aligned, truth = align(alignment, estimate[used]), np.asarray(reference[used], np.float64)
+    aligned, ground_truth = align(alignment, estimate[used]), np.asarray(reference[used], np.float64)
     rotation, translation, centre = np.full((3, len(used)), np.nan)
-    rotation[used] = rotation_angle_deg(aligned[:, :3, :3], truth[:, :3, :3])
-    vectors = [np.einsum("nji,nj->ni", T[:, :3, :3], T[:, :3, 3]) for T in (aligned, truth)]
+    rotation[used] = rotation_angle_deg(aligned[:, :3, :3], ground_truth[:, :3, :3])
+    vectors = [np.einsum("nji,nj->ni", T[:, :3, :3], T[:, :3, 3]) for T in (aligned, ground_truth)]
     translation[used] = np.linalg.norm(vectors[0] - vectors[1], axis=-1)
-    centre[used] = np.linalg.norm(aligned[:, :3, 3] - truth[:, :3, 3], axis=-1)
+    centre[used] = np.linalg.norm(aligned[:, :3, 3] - ground_truth[:, :3, 3], axis=-1)
     means = [float(np.mean(values[used])) for values in (rotation, translation, centre)]
     frames = int(used.sum())
     per_view = (rotation, translation, centre)

@@ -1,8 +1,8 @@
 """Event cameras: simulation, events sorted by pixel, residuals, motion by contrast maximisation."""
 
-from jaxpose.events.pixel_index import Streams as Streams
-from jaxpose.events.pixel_index import by_pixel as by_pixel
-from jaxpose.events.pixel_index import level_at as level_at
+from jaxpose.events.pixel_index import PixelIndex as PixelIndex
+from jaxpose.events.pixel_index import cumulative_polarity as cumulative_polarity
+from jaxpose.events.pixel_index import index_by_pixel as index_by_pixel
 from jaxpose.events.residuals import change_residual as change_residual
 from jaxpose.events.simulation import log_intensity as log_intensity
 from jaxpose.events.simulation import mosaic_mask as mosaic_mask

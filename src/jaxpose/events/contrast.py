@@ -22,7 +22,7 @@ _GRID = (6, 8)  # of inverse depths, rows and columns
 _SMOOTH = 0.02  # weight of the squared differences of neighbouring log inverse depths
 
 
-class Slide(NamedTuple):
+class Displacement(NamedTuple):
     """A constant velocity parallel to the image and how near things are; lengths in typical depths."""
 
     velocity: Float[np.ndarray, "3"]  # [1/s] of the camera in its own axes
@@ -70,7 +70,7 @@ def warped(
     return image
 
 
-def find_slide(camera: Camera, events: Events) -> Slide:
+def find_displacement(camera: Camera, events: Events) -> Displacement:
     """The velocity parallel to the image, and the depths, that make the warped events' contrast largest.
 
     Contrast is the variance of `warped`. A short recording does not tell depth that grows across the image
@@ -109,7 +109,7 @@ def find_slide(camera: Camera, events: Events) -> Slide:
     inverse_depth = _positive(params[2:].reshape(_GRID))
     velocity = jnp.append(params[:2], 0.0)
     contrast = float(jnp.var(warped(camera, located, sample(inverse_depth), velocity)))
-    return Slide(np.asarray(velocity, np.float64), np.asarray(inverse_depth, np.float64), contrast)
+    return Displacement(np.asarray(velocity, np.float64), np.asarray(inverse_depth, np.float64), contrast)
 
 
 def _positive(log_inverse: Float[Array, "rows columns"]) -> Float[Array, "rows columns"]:

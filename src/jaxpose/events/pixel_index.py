@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int
 from jaxpose.events.types import AnyArray, Events
 
 
-class Streams(NamedTuple):
+class PixelIndex(NamedTuple):
     """The same events pixel after pixel, each pixel's in the order of time."""
 
     t: Float[AnyArray, " n"]  # [s]
@@ -20,18 +20,18 @@ class Streams(NamedTuple):
     count: Int[AnyArray, " pixels"]  # how many it has
 
 
-def by_pixel(events: Events, height: int, width: int) -> Streams:
-    """The events of each pixel; numpy, stamps in float64 as they are."""
+def index_by_pixel(events: Events, height: int, width: int) -> PixelIndex:
+    """The events of each pixel; numpy, timestamps in float64 as they are."""
     pixel = events.y.astype(np.int32) * width + events.x
     order = np.argsort(pixel, kind="stable")
     count = np.bincount(pixel, minlength=height * width).astype(np.int32)
     first = np.concatenate([[0], np.cumsum(count)[:-1]]).astype(np.int32)
     level = np.cumsum(events.polarity[order], dtype=np.int32)
     before = np.concatenate([[0], level])[first]
-    return Streams(events.t[order], pixel[order], level - np.repeat(before, count), first, count)
+    return PixelIndex(events.t[order], pixel[order], level - np.repeat(before, count), first, count)
 
 
-def level_at(streams: Streams, pixel: Int[Array, ""], t: Float[Array, ""]) -> Int[Array, ""]:
+def cumulative_polarity(streams: PixelIndex, pixel: Int[Array, ""], t: Float[Array, ""]) -> Int[Array, ""]:
     """Sum of the polarities of a pixel's events up to `t` [s], those at `t` included; by bisection."""
     first, count = streams.first[pixel], streams.count[pixel]
     if len(streams.t) == 0:

@@ -1,8 +1,8 @@
 """Event cameras: every pixel reports by itself, and at once, that its brightness has changed.
 
 An event says that the log intensity of its pixel has changed by a threshold since the pixel's last event. So
-between any two of a pixel's events the change is known, whatever happened in other pixels: `by_pixel` puts
-events in that order, `level_at` reads it.
+between any two of a pixel's events the change is known, whatever happened in other pixels: `index_by_pixel`
+puts events in that order, `cumulative_polarity` reads it.
 """
 
 from collections.abc import Iterable, Iterator
@@ -44,11 +44,11 @@ def simulate(
 ) -> Events:
     """Events of a sensor whose log intensity changes linearly between images (as ESIM, Rebecq et al. 2018).
 
-    `images` gives stamps [s], which increase, and the log intensity that each pixel sees. Every pixel begins
-    at the first image's level and reports each `threshold` of change, at the time of the crossing. `spread`
-    is the standard deviation of thresholds over pixels, for either polarity. For `refractory_s` [s] after an
-    event a pixel sees nothing, and then counts from the level it finds. `noise_hz` is the rate of a pixel's
-    false events. DataError for stamps that do not increase.
+    `images` gives timestamps [s], which increase, and the log intensity that each pixel sees. Every pixel
+    begins at the first image's level and reports each `threshold` of change, at the time of the crossing.
+    `spread` is the standard deviation of thresholds over pixels, for either polarity. For `refractory_s` [s]
+    after an event a pixel sees nothing, and then counts from the level it finds. `noise_hz` is the rate of a
+    pixel's false events. DataError for timestamps that do not increase.
     """
     if threshold <= 0 or min(spread, refractory_s, noise_hz) < 0:
         raise ValueError(
@@ -68,7 +68,7 @@ def simulate(
     parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     for t, image in images:
         if not t > t_before:
-            raise DataError(f"simulate: expected stamps that increase, got {t:g} s after {t_before:g} s")
+            raise DataError(f"simulate: expected timestamps that increase, got {t:g} s after {t_before:g} s")
         now = np.asarray(image, np.float64).ravel()
         parts += _crossings(before, now, t_before, t, steps, level, blind_until, refractory_s)
         t_before, before = t, now

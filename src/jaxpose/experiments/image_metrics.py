@@ -19,7 +19,7 @@ def pose_numbers(errors: PoseErrors, extent: float) -> dict[str, float]:
     }
 
 
-def likeness(
+def image_metrics(
     rendered: Float[np.ndarray, "h w 3"], reference: Float[np.ndarray, "h w 3"]
 ) -> dict[str, float | None]:
     """How alike two images in [0, 1] are; LPIPS is None without its weights, and for small images."""

@@ -84,7 +84,7 @@ class Setup(Protocol):
     def train(self) -> _Train: ...
 
 
-def fresh(setup: Setup, seed: int) -> Trained:
+def initial_state(setup: Setup, seed: int) -> Trained:
     """A training at its start."""
     history = np.full((setup.train.steps // CHUNK, len(COLUMNS)), np.nan)
     return Trained(setup.trainer.start(jax.random.key(seed)), history)
@@ -131,7 +131,7 @@ def train(
     return Trained(state, history)
 
 
-def prepare(folder: Path, config: Any, settings: dict[str, Any], *, resume: bool) -> None:
+def set_up_run_folder(folder: Path, config: Any, settings: dict[str, Any], *, resume: bool) -> None:
     """Leave in the folder the config, and earlier results only if they are this run's and to be kept."""
     stored = folder / "settings.json"
     settings = json.loads(json.dumps(settings, default=_plain))
@@ -150,10 +150,10 @@ def pose_reader(field: PoseField, t: Float[np.ndarray, " n"]) -> Callable[[Any],
 
 
 def mean_errors(
-    estimate: Float[np.ndarray, "n 4 4"], truth: Float[np.ndarray, "n 4 4"]
+    estimate: Float[np.ndarray, "n 4 4"], ground_truth: Float[np.ndarray, "n 4 4"]
 ) -> tuple[float, float]:
     """Mean rotation [deg] and translation error after alignment, as `metrics.pose_errors`."""
-    found = trajectory_error.pose_errors(estimate, truth)
+    found = trajectory_error.pose_errors(estimate, ground_truth)
     return found.rotation_deg, found.translation
 
 
@@ -231,7 +231,7 @@ def load_run(
     config = config_type(**settings | {"data": Path(settings["data"]), "net": net})
     problem = load(config)
     setup = build(config, problem)
-    state = checkpoint_file.load(Path(folder) / "checkpoint.npz", fresh(setup, config.seed)).state
+    state = checkpoint_file.load(Path(folder) / "checkpoint.npz", initial_state(setup, config.seed)).state
     scene = set_progress(state.scene, jnp.ones(()))
     return Loaded(problem, setup, state._replace(scene=scene))
 

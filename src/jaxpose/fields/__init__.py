@@ -12,11 +12,11 @@ from jaxpose.fields.composition import anchored as anchored
 from jaxpose.fields.composition import body_to_camera as body_to_camera
 from jaxpose.fields.composition import in_frame as in_frame
 from jaxpose.fields.composition import intrinsic as intrinsic
+from jaxpose.fields.composition import piecewise_geodesic as piecewise_geodesic
 from jaxpose.fields.composition import refine as refine
-from jaxpose.fields.composition import stamped as stamped
 from jaxpose.fields.fitting import FitResult as FitResult
 from jaxpose.fields.fitting import fit as fit
-from jaxpose.fields.projection import pin as pin
+from jaxpose.fields.projection import project_onto_poses as project_onto_poses
 from jaxpose.fields.types import Params as Params
 from jaxpose.fields.types import PoseField as PoseField
 from jaxpose.fields.types import PoseFn as PoseFn

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxpose.fields.composition import stamped
+from jaxpose.fields.composition import piecewise_geodesic
 from jaxpose.fields.types import PoseField
 from jaxpose.geometry import se3
 
@@ -58,9 +58,9 @@ def control_points(control_poses: Float[Array, "n 4 4"]) -> Float[Array, "n 7"]:
 def control_points_along(
     times: Float[np.ndarray, " m"], poses: Float[np.ndarray, "m 4 4"], intervals: int
 ) -> Float[Array, "n 7"]:
-    """The parameters of a spline over stamped poses whose control poses lie on them (`stamped`), as a start.
+    """The parameters of a spline over stamped poses whose control poses lie on them (`piecewise_geodesic`).
 
-    Its span is from the first of `times` [s] to the last, in `intervals` knot intervals.
+    They are a start for a fit. The span is from the first of `times` [s] to the last, in `intervals` knot intervals.
     """
     first, last = float(times[0]), float(times[-1])
     knots = first + (np.arange(intervals + 3) - 1) * ((last - first) / intervals)
@@ -69,7 +69,7 @@ def control_points_along(
 
 @jax.jit
 def _control_points_at(knots, times, poses):
-    return control_points(jax.vmap(stamped(times, poses))(knots))
+    return control_points(jax.vmap(piecewise_geodesic(times, poses))(knots))
 
 
 def _cumulative_basis(s: Float[Array, ""]) -> Float[Array, "3"]:

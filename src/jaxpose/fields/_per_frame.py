@@ -9,18 +9,18 @@ from jaxpose.geometry import se3
 
 
 def table(times: Float[Array | np.ndarray, " n"]) -> PoseField:
-    """One free twist per stamp [s], zero at init; the pose at `t` is that of the nearest stamp.
+    """One free twist per timestamp [s], zero at init; the pose at `t` is that of the nearest timestamp.
 
     The parameters are an array (n, 6). Every derivative in time is zero. `times` must increase.
     """
-    stamps = np.asarray(times, np.float64)
-    if stamps.size == 0 or not np.all(np.diff(stamps) > 0):
-        raise ValueError("times: expected at least one stamp, increasing")
-    borders = (stamps[1:] + stamps[:-1]) / 2
+    timestamps = np.asarray(times, np.float64)
+    if timestamps.size == 0 or not np.all(np.diff(timestamps) > 0):
+        raise ValueError("times: expected at least one timestamp, increasing")
+    borders = (timestamps[1:] + timestamps[:-1]) / 2
 
     def init(key):
         del key  # the identity needs no chance
-        return jnp.zeros((stamps.size, 6))
+        return jnp.zeros((timestamps.size, 6))
 
     def pose(params, t):
         return se3.exp(params[jnp.searchsorted(jnp.asarray(borders, t.dtype), t)])

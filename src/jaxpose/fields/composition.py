@@ -41,8 +41,8 @@ def intrinsic(outer: PoseField, inner: PoseField) -> PoseField:
     return PoseField(init, pose)
 
 
-def stamped(times: Float[Array, " n"], poses: Float[Array, "n 4 4"]) -> PoseFn:
-    """The pose between stamped poses at constant twist; before the first and after the last stamp, these.
+def piecewise_geodesic(times: Float[Array, " n"], poses: Float[Array, "n 4 4"]) -> PoseFn:
+    """The pose between stamped poses at constant twist; before the first and after the last timestamp, these.
 
     `times` [s] must increase. Both may be traced.
     """

@@ -10,7 +10,7 @@ from jaxpose.fields.types import Params
 from jaxpose.geometry import se3
 
 
-def pin(
+def project_onto_poses(
     poses_of: Callable[[Params], Float[Array, "k 4 4"]],
     params: Params,
     poses: Float[Array, "k 4 4"],

@@ -14,10 +14,12 @@ The pose at time t is a product of factors, factor 0 . factor 1 . ..., camera-to
                 appended to them.
     bspline     span [s]; control_points (n, 7): position and quaternion wxyz less (1, 0, 0, 0), the first one
                 knot interval before the span
-    table       times (n,) [s]; poses (n, 4, 4): that of the nearest stamp, the earlier of two equally near
-    stamped     times (n,) [s]; poses (n, 4, 4): constant twist between stamps, at rest before and after
+    table       times (n,) [s]; poses (n, 4, 4): that of the nearest timestamp, the earlier of two equally
+    near stamped     times (n,) [s]; poses (n, 4, 4): constant twist between timestamps, at rest before and
+    after
 
-Other compositions (`fields/composition.py`) are products too: a constant pose is a `stamped` with one stamp.
+Other compositions (`fields/composition.py`) are products too: a constant pose is a `piecewise_geodesic` with
+one timestamp.
 """
 
 from collections.abc import Mapping, Sequence
@@ -93,12 +95,12 @@ def bspline_factor(span: tuple[float, float], params: Float[Array, "n 7"]) -> Fa
     }
 
 
-def table_factor(times: Float[np.ndarray, " n"], params: Float[Array, "n 6"]) -> Factor:
+def per_frame_factor(times: Float[np.ndarray, " n"], params: Float[Array, "n 6"]) -> Factor:
     """The table of `fields.table(times)` with these parameters."""
     return {"kind": "table", "times": np.asarray(times, np.float64), "poses": np.asarray(se3.exp(params))}
 
 
-def stamped_factor(times: Float[Array, " n"], poses: Float[Array, "n 4 4"]) -> Factor:
+def piecewise_geodesic_factor(times: Float[Array, " n"], poses: Float[Array, "n 4 4"]) -> Factor:
     """The motion of `fields.stamped(times, poses)`."""
     return {"kind": "stamped", "times": np.asarray(times), "poses": np.asarray(poses)}
 

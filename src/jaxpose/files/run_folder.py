@@ -10,12 +10,12 @@ import jaxpose
 
 
 def run_folder(experiment: str, *, name: str | None = None, out: Path | str | None = None) -> Path:
-    """Make and return the folder of a run: `out` if given, else `outputs/<experiment>/<name or time stamp>`.
+    """Make and return the folder of a run: `out` if given, else `outputs/<experiment>/<name or timestamp>`.
 
     A folder that was named may exist already, to be written over or resumed.
     """
-    stamp = f"{datetime.now():%Y-%m-%d_%H-%M-%S.%f}"
-    folder = Path(out) if out is not None else Path("outputs") / experiment / (name or stamp)
+    timestamp = f"{datetime.now():%Y-%m-%d_%H-%M-%S.%f}"
+    folder = Path(out) if out is not None else Path("outputs") / experiment / (name or timestamp)
     folder.mkdir(parents=True, exist_ok=out is not None or name is not None)
     return folder
 

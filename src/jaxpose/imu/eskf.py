@@ -43,7 +43,7 @@ class Step(NamedTuple):
     measured: Bool[Array, "*n"]
 
 
-class Passed(NamedTuple):
+class FilterStep(NamedTuple):
     """What each step leaves behind, for the smoother and for the user."""
 
     predicted: State
@@ -154,13 +154,13 @@ def forward(
     noise: ImuNoise,
     pose_noise: PoseNoise,
     gravity_world: Float[Array, "3"],
-) -> Passed:
+) -> FilterStep:
     """The filter over all `steps` from the `start` and its covariance; noise as scalar arrays."""
 
     def step(carry: tuple[State, Float[Array, "15 15"]], step: Step):
         predicted, P, F = _predict(*carry, step, noise, gravity_world)
         state, covariance, innovation, S, nis = _correct(predicted, P, step, pose_noise)
-        passed = Passed(predicted, P, F, state, covariance, innovation, S, nis)
+        passed = FilterStep(predicted, P, F, state, covariance, innovation, S, nis)
         return (state, covariance), passed
 
     return jax.lax.scan(step, (start, covariance), steps)[1]
@@ -168,7 +168,7 @@ def forward(
 
 @jax.jit
 def backward(
-    start: State, covariance: Float[Array, "15 15"], passed: Passed
+    start: State, covariance: Float[Array, "15 15"], passed: FilterStep
 ) -> tuple[State, Float[Array, "n 15 15"]]:
     """States and covariances given later poses too, the `start` first (Rauch, Tung and Striebel)."""
     last = jax.tree.map(lambda x: x[-1], (passed.state, passed.covariance))

@@ -2,8 +2,9 @@
 
 The numpy side of `ekf`: what is checked, which pose belongs to which reading, and the result per reading.
 
-Tested on EuRoC, whose truth is a smoothed fusion and no measurement: white noise of a stated size is added to
-its poses, and the IMU's densities are fitted by likelihood on half of one recording (experiments/README.md).
+Tested on EuRoC, whose ground truth is a smoothed fusion and no measurement: white noise of a stated size is
+added to its poses, and the IMU's densities are fitted by likelihood on half of one recording
+(experiments/README.md).
 """
 
 from typing import NamedTuple
@@ -33,7 +34,7 @@ _MOST_PERIODS = 10  # the trapezoidal rule knows nothing of what happens in betw
 
 
 class Filtered(NamedTuple):
-    """The body's motion at every IMU stamp, SI units; rows before the first pose are NaN.
+    """The body's motion at every IMU timestamp, SI units; rows before the first pose are NaN.
 
     Readings are free of bias, the acceleration of gravity too. Innovations are [translation (world), rotation
     (body)] of the measured pose against the predicted one, NaN where there was no pose.
@@ -53,7 +54,7 @@ class Filtered(NamedTuple):
     nis: Float[np.ndarray, " n"]  # normalised innovation squared, chi-square of 6 dof if all is as stated
     log_likelihood: float  # of the poses after the first
     poses_used: int
-    poses_skipped: int  # not finite, beyond the readings, or not the nearest to any stamp
+    poses_skipped: int  # not finite, beyond the readings, or not the nearest to any timestamp
 
 
 def filter_imu(
@@ -72,8 +73,8 @@ def filter_imu(
     A pose corrects the state at the reading nearest to it, which is carried to the pose's own time by its own
     velocity and rate: nothing is interpolated. `smooth` lets later poses speak for earlier states too; the
     innovations stay those of the forward pass, and the acceleration is then the slope of the velocity. Poses
-    with NaN are left out and counted. DataError for stamps that do not rise, readings that are not finite or
-    more than ten periods apart, or fewer than two poses within the readings; ValueError for sigmas.
+    with NaN are left out and counted. DataError for timestamps that do not rise, readings that are not finite
+    or more than ten periods apart, or fewer than two poses within the readings; ValueError for sigmas.
 
     A data sheet knows nothing of vibration or of the timing of poses, so on a real machine its densities are
     too small by far. State those that hold there, for example the ones of the highest `log_likelihood`.
@@ -125,7 +126,7 @@ def filter_imu(
 
 
 def _readings_checked(imu: Imu) -> Float[np.ndarray, " n"]:
-    """The stamps of readings that can be used."""
+    """The timestamps of readings that can be used."""
     t = np.asarray(imu.t, np.float64)
     _check_rising("IMU", t)
     finite = np.isfinite(np.concatenate([imu.omega_body, imu.acceleration_body], axis=1)).all(axis=1)
@@ -146,7 +147,7 @@ def _check_rising(name: str, t: Float[np.ndarray, " n"]) -> None:
     rise = np.diff(t) > 0
     if not rise.all():
         row = int(np.argmin(rise)) + 1
-        raise DataError(f"{name}: expected rising stamps, got {t[row]} after {t[row - 1]} s")
+        raise DataError(f"{name}: expected rising timestamps, got {t[row]} after {t[row - 1]} s")
 
 
 def _nearest_poses(

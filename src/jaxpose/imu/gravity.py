@@ -31,5 +31,6 @@ def gravity_note(
         return ()
     return (
         f"{sensor}'s mean force is {norm:.3g} m/s^2, {off:.0f} deg from up by the true poses, "
-        f"where gravity is {gravity:.3g}: check unit and extrinsics, and that the truth's z axis points up",
+        f"where gravity is {gravity:.3g}: check unit and extrinsics, and that ground truth's z axis "
+        f"points up",
     )

@@ -15,7 +15,9 @@ def integrate_gyro(
     omega_body: Float[Array, "n 3"],
     mask: Bool[Array, " n"] | None = None,
 ) -> Float[Array, "n 3 3"]:
-    """Rotation `R_ref_body` at the stamps from the body rate [rad/s], starting at the first; midpoint rule.
+    """Rotation `R_ref_body` at the timestamps from the body rate [rad/s], starting at the first.
+
+    Midpoint rule.
 
     Where `mask` is False (padding at the end) the rotation stays what it was.
     """

@@ -77,9 +77,9 @@ def interpolant(
 ) -> Interpolant:
     """Cubic splines through the positions; for the rotations slerp or a twice differentiable spline.
 
-    Slerp is METHOD's (section 5); its body rate is constant between two stamps and jumps at each. Derivatives
-    are the splines' own. Rows that are not finite (no truth) are left out and bridged. DataError if fewer
-    than two are left or the times do not rise.
+    Slerp is METHOD's (section 5); its body rate is constant between two timestamps and jumps at each.
+    Derivatives are the splines' own. Rows that are not finite (no ground truth) are left out and bridged.
+    DataError if fewer than two are left or the times do not rise.
     """
     usable = np.isfinite(poses).all(axis=(1, 2))
     times, poses = np.asarray(times, np.float64)[usable], np.asarray(poses, np.float64)[usable]
@@ -129,7 +129,7 @@ def add_noise(imu: Imu, noise: ImuNoise, key: PRNGKeyArray | None) -> Imu:
 
 
 def _noise(key: PRNGKeyArray, imu: Imu, density: float, walk: float):
-    """White noise plus walking bias at the stamps, an array of the readings' own kind and precision."""
+    """White noise plus walking bias at the timestamps, an array of the readings' own kind and precision."""
     normal = jax.random.normal(key, (2, len(imu.t), 3), jnp.float32)
     lib = np if isinstance(imu.omega_body, np.ndarray) else jnp
     white, steps = lib.asarray(normal, imu.omega_body.dtype)

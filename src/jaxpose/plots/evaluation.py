@@ -22,8 +22,9 @@ def comparison(
 ) -> None:
     """Positions from above and from the side, the estimate's coloured by its error, and errors over time.
 
-    `estimate` is drawn as it comes: align it as its error was computed. The time starts at the first stamp;
-    without `t` [s] errors are drawn over the number of the pose. Errors of less than a metre are in cm.
+    `estimate` is drawn as it comes: align it as its error was computed. The time starts at the first
+    timestamp; without `t` [s] errors are drawn over the number of the pose. Errors of less than a metre are
+    in cm.
     """
     across, along, up, sign = _view_axes(reference)
     unit, factor = ("cm", 100.0) if np.nanmax(translation_m) < 1 else ("m", 1.0)
@@ -45,7 +46,7 @@ def comparison(
             axes.autoscale_view()
         if sign < 0:
             views[1].invert_yaxis()
-        views[0].legend(handles=_keys(truth=True, lost=False), loc="best")
+        views[0].legend(handles=_keys(ground_truth=True, lost=False), loc="best")
         assert shade is not None
         label = f"distance to the reference [{unit}]"
         figure.colorbar(shade, cax=figure.add_subplot(cells[1, :]), orientation="horizontal", label=label)

@@ -44,48 +44,50 @@ class History(NamedTuple):
 
 def cameras(
     path: Path | str,
-    truth: Float[np.ndarray, "n 4 4"],
+    ground_truth: Float[np.ndarray, "n 4 4"],
     start: Float[np.ndarray, "n 4 4"],
     estimate: Float[np.ndarray, "n 4 4"],
     title: str,
 ) -> None:
-    """Camera-to-world poses in 3D: start and truth on the left, estimate and truth on the right.
+    """Camera-to-world poses in 3D: start and ground truth on the left.
+
+    Estimate and ground truth on the right.
 
     A line joins each camera with its true place; of many cameras only some are drawn as frusta. All are
     drawn as they come: align them as their errors were computed. Upright is the world axis nearest to the
     cameras' mean up; scene units.
     """
-    across, along, up, sign = _view_axes(truth)
+    across, along, up, sign = _view_axes(ground_truth)
     order = [across, along, up]
     if np.linalg.det(np.eye(3)[order]) * sign < 0:
         order[:2] = along, across  # or the picture would be a mirror image
-    centres = truth[:, :3, 3]
+    centres = ground_truth[:, :3, 3]
     extent = float(np.linalg.norm(centres - centres.mean(0), axis=1).max()) or 1.0
     length = _TICK * extent
     is_path = np.median(np.linalg.norm(np.diff(centres, axis=0), axis=1)) < _PATH_STEP * extent
-    shown = slice(None, None, -(-len(truth) // _MOST_FRUSTA))
+    shown = slice(None, None, -(-len(ground_truth) // _MOST_FRUSTA))
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=(11, 5.4), dpi=DPI, layout="constrained")
         panels: list[Any] = list(figure.subplots(1, 2, subplot_kw={"projection": "3d"}))
         for axes, poses, color, name in zip(
             panels, (start, estimate), (LOST, ESTIMATE), ("start", "estimate"), strict=True
         ):
-            joints = np.stack([poses[:, order, 3], truth[:, order, 3]], axis=1)
+            joints = np.stack([poses[:, order, 3], ground_truth[:, order, 3]], axis=1)
             joints = joints if is_path else joints[shown]
             axes.add_collection3d(Line3DCollection(list(joints), colors=color, lw=0.8, alpha=0.35))
-            for T, shade, width in ((truth, TRUTH, 1.7), (poses, color, 0.9)):
+            for T, shade, width in ((ground_truth, TRUTH, 1.7), (poses, color, 0.9)):
                 if is_path:
                     axes.plot(*T[:, order, 3].T, color=shade, lw=width)
                 edges = _frusta(T[shown], length)[..., order]
                 axes.add_collection3d(Line3DCollection(list(edges), colors=shade, lw=width))
-            axes.set(title=f"{name} and truth")
-        _equal_axes(panels, np.concatenate([truth, start, estimate])[:, order, 3], length, sign < 0)
+            axes.set(title=f"{name} and ground truth")
+        _equal_axes(panels, np.concatenate([ground_truth, start, estimate])[:, order, 3], length, sign < 0)
         for axes in panels:
             axes.set(xlabel=_AXES[order[0]], ylabel=_AXES[order[1]], zlabel=_AXES[order[2]])
             axes.view_init(elev=28, azim=-58)
             axes.tick_params(labelsize=7)
             axes.locator_params(nbins=5)
-        colors = {"truth": TRUTH, "start": LOST, "estimate": ESTIMATE}
+        colors = {"ground_truth": TRUTH, "start": LOST, "estimate": ESTIMATE}
         keys = [Line2D([], [], color=color, lw=1.6, label=name) for name, color in colors.items()]
         figure.legend(handles=keys, loc="outside lower center", ncols=3)
         figure.suptitle(title)

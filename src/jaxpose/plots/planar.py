@@ -29,18 +29,18 @@ def reconstruction(
 ) -> None:
     """A photograph with the outlines of its patches beside the neural image that was made from them.
 
-    Images are in [0, 1]; `outlines` are corners [px] under the names truth, start and estimate. What no patch
-    has `covered` is faded in both: nothing is known there.
+    Images are in [0, 1]; `outlines` are corners [px] under the names ground truth, start and estimate. What
+    no patch has `covered` is faded in both: nothing is known there.
     """
     fade = np.where(covered, 1.0, 0.3)[..., None]
     height, width = photograph.shape[:2]
-    colours = {"truth": _TRUTH, "start": _START, "estimate": _ESTIMATE}
-    styles = {"truth": (3.4, "solid"), "start": (2.2, "dashed"), "estimate": (1.3, "solid")}
+    colours = {"ground_truth": _TRUTH, "start": _START, "estimate": _ESTIMATE}
+    styles = {"ground_truth": (3.4, "solid"), "start": (2.2, "dashed"), "estimate": (1.3, "solid")}
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=(12, 12 * 0.5 * height / width + 0.9), dpi=DPI, layout="constrained")
         left, right = figure.subplots(1, 2)
         for axes, picture, drawn, name in (
-            (left, photograph, ("truth", "estimate", "start"), "photograph, patches on it"),
+            (left, photograph, ("ground_truth", "estimate", "start"), "photograph, patches on it"),
             (right, neural, ("estimate",), "neural image, from the patches alone"),
         ):
             axes.imshow(np.clip(picture, 0, 1) * fade, interpolation="nearest")

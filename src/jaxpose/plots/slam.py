@@ -63,9 +63,9 @@ def trajectory(
     `estimate` is drawn as it comes: align it as its error was computed. The view from above is along the
     world axis nearest to the cameras' mean up.
     """
-    truth = estimate if reference is None else reference
-    usable = np.isfinite(truth).all(axis=(1, 2))
-    across, along, up, sign = _view_axes(truth[usable])
+    ground_truth = estimate if reference is None else reference
+    usable = np.isfinite(ground_truth).all(axis=(1, 2))
+    across, along, up, sign = _view_axes(ground_truth[usable])
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=(11, 5.2), dpi=DPI, layout="constrained")
         views: list[Axes] = list(figure.subplots(1, 2))
@@ -74,7 +74,7 @@ def trajectory(
             views, ((across, along), (across, up)), ("from above", "from the side"), strict=True
         ):
             if reference is not None:
-                axes.plot(*truth[usable][:, [a, b], 3].T, color=TRUTH, lw=3.5, alpha=0.5)
+                axes.plot(*ground_truth[usable][:, [a, b], 3].T, color=TRUTH, lw=3.5, alpha=0.5)
             centres = estimate[:, [a, b], 3]
             if reference is None:
                 axes.plot(*centres.T, color=ESTIMATE, lw=1.4)
@@ -88,7 +88,7 @@ def trajectory(
         if sign < 0:
             views[1].invert_yaxis()
         if shade is not None:
-            figure.colorbar(shade, ax=views, label="distance to the truth [cm]", shrink=0.9, pad=0.015)
+            figure.colorbar(shade, ax=views, label="distance to the ground truth [cm]", shrink=0.9, pad=0.015)
         views[0].legend(handles=_keys(reference is not None, bool(lost.any())), loc="best")
         figure.suptitle(title)
         _save(figure, path)
@@ -290,10 +290,10 @@ def _shaded(axes: Axes, centres: Float[np.ndarray, "n 2"], values: Float[np.ndar
     return line
 
 
-def _keys(truth: bool, lost: bool) -> list[Line2D]:
+def _keys(ground_truth: bool, lost: bool) -> list[Line2D]:
     """Legend of a trajectory."""
-    keys = [Line2D([], [], color=TRUTH, lw=3.5, alpha=0.5, label="truth")] if truth else []
-    keys.append(Line2D([], [], color="#9c2c8c" if truth else ESTIMATE, lw=2, label="estimate"))
+    keys = [Line2D([], [], color=TRUTH, lw=3.5, alpha=0.5, label="ground_truth")] if ground_truth else []
+    keys.append(Line2D([], [], color="#9c2c8c" if ground_truth else ESTIMATE, lw=2, label="estimate"))
     keys.append(Line2D([], [], color="black", marker="o", ls="", ms=5, label="start"))
     if lost:
         keys.append(Line2D([], [], color=LOST, marker="x", ls="", mew=1.6, label="lost"))

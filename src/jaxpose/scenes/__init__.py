@@ -4,7 +4,7 @@ from jaxpose.scenes._nerf import NerfConfig as NerfConfig
 from jaxpose.scenes._nerf import nerf as nerf
 from jaxpose.scenes.types import SceneField as SceneField
 from jaxpose.scenes.voxel_grid import GridConfig as GridConfig
-from jaxpose.scenes.voxel_grid import box as box
+from jaxpose.scenes.voxel_grid import bounding_grid as bounding_grid
 from jaxpose.scenes.voxel_grid import grid as grid
 from jaxpose.scenes.voxel_grid import grow as grow
 from jaxpose.scenes.voxel_grid import merge as merge

@@ -67,7 +67,7 @@ def grid(config: GridConfig) -> SceneField:
     return SceneField(init, query)
 
 
-def box(
+def bounding_grid(
     points: np.ndarray, *, voxel: float | None = None, levels: int = 2, nodes: int = 4_000_000
 ) -> GridConfig:
     """A grid around world points (n, 3) [m], a quarter of its size wider on every side.

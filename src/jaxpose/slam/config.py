@@ -54,11 +54,11 @@ class SlamConfig:
             raise ValueError(f"hold_out: expected 0, or 2 or more, got {self.hold_out}")
 
     @property
-    def senses_rotation(self) -> bool:
+    def uses_gyroscope(self) -> bool:
         """Whether the gyroscope is used."""
         return self.imu != "none"
 
     @property
-    def senses_speed(self) -> bool:
+    def uses_accelerometer(self) -> bool:
         """Whether the accelerometer carries the speed from one frame to the next."""
         return self.imu in ("accelerometer", "combined")

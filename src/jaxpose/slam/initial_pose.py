@@ -23,13 +23,13 @@ class FirstPose(NamedTuple):
 
 
 def first_pose(recording: Recording) -> FirstPose:
-    """By the truth where it is known (as in NICE-SLAM), else at the origin, upright where a sensor tells.
+    """By ground truth where it is known (as in NICE-SLAM), else at the origin, upright where a sensor tells.
 
     Upright: gravity points where the recording states it, and the camera's heading is x (REP 103).
     """
-    truth = recording.T_world_cam
-    if truth is not None and np.isfinite(truth[0]).all():
-        return FirstPose(np.array(truth[0], np.float64), ())
+    ground_truth = recording.T_world_cam
+    if ground_truth is not None and np.isfinite(ground_truth[0]).all():
+        return FirstPose(np.array(ground_truth[0], np.float64), ())
     force = first_force(recording)
     if force is None or not is_gravity(force, recording.gravity_world):
         return FirstPose(np.eye(4), ("the world's frame is the first camera's",))

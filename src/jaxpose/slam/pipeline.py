@@ -16,12 +16,12 @@ from jaxpose.scenes import GridConfig, SceneField
 from jaxpose.slam.config import ImuMode, SlamConfig
 from jaxpose.slam.initial_pose import first_pose
 from jaxpose.slam.keyframes import read_keyframes
-from jaxpose.slam.map.texture import paint, painted
-from jaxpose.slam.map.world import first_grid, map_frame, room_for, scene_params, seen_points
+from jaxpose.slam.map.texture import make_texture, textured
+from jaxpose.slam.map.world import grow_to_fit, initial_grid, map_frame, scene_params, seen_points
 from jaxpose.slam.observation import is_blank, to_device
 from jaxpose.slam.system import System, make_system
 from jaxpose.slam.tracker import next_pose
-from jaxpose.slam.tracking.intrinsic_frame import Refit, due, window
+from jaxpose.slam.tracking.intrinsic_frame import Refit, is_due, window
 from jaxpose.slam.tracking.predict import GYRO_BIAS_SIGMA
 from jaxpose.slam.types import SlamState, no_frames
 
@@ -31,7 +31,7 @@ _DEFAULT = SlamConfig()
 
 
 class Progress(NamedTuple):
-    """One frame done; `truth_error` [m] is the distance to the truth with the first poses put together."""
+    """One frame done; `truth_error` [m] is the distance to ground truth with the first poses put together."""
 
     index: int
     count: int
@@ -72,9 +72,10 @@ def run(
 ) -> SlamResult:
     """Track every frame of an RGB-D recording and map what it sees (paper section 3.4, METHOD section 5).
 
-    The world's frame is `first_pose`'s: that of the truth, or upright by an accelerometer; `gravity_world` is
-    in it. `state` is where an earlier run stood, to go on from there. Raises DataError where the recording
-    cannot be tracked: fewer than two frames, no depth in the first, IMU asked for and not there.
+    The world's frame is `first_pose`'s: that of the ground truth, or upright by an accelerometer;
+    `gravity_world` is in it. `state` is where an earlier run stood, to go on from there. Raises DataError
+    where the recording cannot be tracked: fewer than two frames, no depth in the first, IMU asked for and not
+    there.
     """
     system = make_system(recording, config)
     state = begin(system) if state is None else state
@@ -98,7 +99,7 @@ def begin(system: System, size: GridConfig | None = None) -> SlamState:
         points = seen_points(recording.read(0), recording, T_world_cam)
         if len(points) == 0:
             raise DataError(f"{recording.name}: expected depth in the first frame, found none")
-        size = first_grid(points, config)
+        size = initial_grid(points, config)
     key, field_key = jax.random.split(jax.random.key(config.seed))
     return SlamState(
         0, frames, np.zeros(6), np.zeros(3), np.zeros(3), GYRO_BIAS_SIGMA, np.zeros(3),
@@ -115,8 +116,8 @@ def step(system: System, state: SlamState, frame: Frame) -> SlamState:
     image = to_device(frame)._replace(exposure=state.exposure)
     if i > 0:
         state = next_pose(system, state, frame, image, generator, track_key)
-    if system.refit is not None and due(i, len(recording.t)):
-        state = _reframed(system.refit, state, recording.t, i)
+    if system.refit is not None and is_due(i, len(recording.t)):
+        state = _update_intrinsic_frame(system.refit, state, recording.t, i)
     state = state._replace(done=i + 1, key=key)
     T_world_cam = state.frames.T_world_body[i] @ recording.T_body_cam
     points = seen_points(frame, recording, T_world_cam)
@@ -124,12 +125,12 @@ def step(system: System, state: SlamState, frame: Frame) -> SlamState:
         return state
     away = np.linalg.norm(points - T_world_cam[:3, 3], axis=1)
     state = state._replace(far=max(state.far, 1.2 * float(np.percentile(away, 99))))
-    state = room_for(points, state)
+    state = grow_to_fit(points, state)
     image = image._replace(exposure=state.exposure)
     return map_frame(system.world(state.grid), recording, config, state, image, points, generator, map_key)
 
 
-def _reframed(refit: Refit, state: SlamState, t: Float[np.ndarray, " n"], i: int) -> SlamState:
+def _update_intrinsic_frame(refit: Refit, state: SlamState, t: Float[np.ndarray, " n"], i: int) -> SlamState:
     """The state with the intrinsic frame brought to the motions up to frame i."""
     chosen, poses = window(i), state.frames.T_world_body
     motions = np.linalg.inv(poses[chosen - 1]) @ poses[chosen]
@@ -144,10 +145,10 @@ def _due(system: System, state: SlamState, frame: Frame) -> bool:
     config, frames, i = system.config, state.frames, state.done - 1
     held_out = config.hold_out > 0 and i % config.hold_out == config.hold_out - 1
     mapped = np.flatnonzero(frames.mapped)
-    doubted = frames.lost[i] or frames.unlike[i]
+    doubted = frames.lost[i] or frames.appearance_outlier[i]
     if held_out or doubted or not len(mapped):
         return not held_out and not doubted
-    unconfirmed = frames.lost[i - 1] and not config.senses_speed
+    unconfirmed = frames.lost[i - 1] and not config.uses_accelerometer
     passed = system.recording.t[i] - system.recording.t[mapped[-1]]
     return bool(not unconfirmed and not is_blank(frame) and passed >= config.map_every_s)
 
@@ -177,7 +178,7 @@ def _finish(system: System, state: SlamState) -> SlamResult:
     scene, (values,) = system.world(state.grid).scene, scene_params(state.map)
     keyframes = np.flatnonzero(frames.keyframe)
     views = read_keyframes(recording, keyframes, T_world_cam)
-    coat = paint(state.grid, np.asarray(values[..., 0]), views, recording.camera)
+    texture = make_texture(state.grid, np.asarray(values[..., 0]), views, recording.camera)
     return SlamResult(
         T_world_cam,
         frames.T_inner,
@@ -191,9 +192,9 @@ def _finish(system: System, state: SlamState) -> SlamResult:
         valid=frames.valid,
         sigma=frames.sigma,
         seconds=frames.seconds,
-        scene=painted(scene, state.grid),
+        scene=textured(scene, state.grid),
         grid=state.grid,
-        scene_params=(values, jax.tree.map(jnp.asarray, coat)),
+        scene_params=(values, jax.tree.map(jnp.asarray, texture)),
         keyframes=keyframes,
         field=field,
         field_params=fitted.params,

@@ -17,9 +17,9 @@ from jaxpose.slam.config import IMU_WEIGHTS, SlamConfig
 from jaxpose.slam.keyframes import look
 from jaxpose.slam.map.world import World, make_world
 from jaxpose.slam.tracking.intrinsic_frame import Refit, make_refit
-from jaxpose.slam.tracking.predict import Readings, integrate, no_readings
-from jaxpose.slam.tracking.reference_frames import Framed, make_field
-from jaxpose.slam.tracking.steps import make_settle
+from jaxpose.slam.tracking.predict import PreintegratedImu, no_imu, preintegrate
+from jaxpose.slam.tracking.reference_frames import FramedField, make_field
+from jaxpose.slam.tracking.steps import make_field_update
 
 # How well a PoseNet over a few frames follows a hand's motion between them: added to the sensor's own noise.
 FIELD_SIGMAS = ResidualSigmas(loose=0.004, tight=0.1, accelerometer=1.0)
@@ -30,8 +30,8 @@ class System(NamedTuple):
 
     recording: Recording
     config: SlamConfig
-    framed: Framed
-    readings: Callable[[int, np.ndarray, np.ndarray, np.ndarray], Readings]
+    framed: FramedField
+    readings: Callable[[int, np.ndarray, np.ndarray, np.ndarray], PreintegratedImu]
     world: Callable[[GridConfig], World]
     look: Callable[[int], np.ndarray]  # of a keyframe (`keyframes.look`)
     refit: Refit | None  # of the frame `intrinsic`
@@ -43,32 +43,36 @@ def make_system(recording: Recording, config: SlamConfig) -> System:
     t = recording.t
     framed = make_field(config.frame, config.field, float(np.median(np.diff(t))), float(t[-1] - t[0]))
     view = angle_of_view(recording.camera)
-    settle = make_settle(framed, config.track, IMU_WEIGHTS[config.imu], _sigmas(recording, config), view)
+    field_update = make_field_update(
+        framed, config.track, IMU_WEIGHTS[config.imu], _sigmas(recording, config), view
+    )
     refit = None if framed.parts is None else make_refit(*framed.parts, view)
-    world = lru_cache(maxsize=1)(partial(make_world, recording, config, settle))
+    world = lru_cache(maxsize=1)(partial(make_world, recording, config, field_update))
     keyframe_look = lru_cache(None)(lambda i: look(recording.read(i)))
     return System(recording, config, framed, readings, world, keyframe_look, refit)
 
 
 def _readings(
     recording: Recording, config: SlamConfig
-) -> Callable[[int, np.ndarray, np.ndarray, np.ndarray], Readings]:
+) -> Callable[[int, np.ndarray, np.ndarray, np.ndarray], PreintegratedImu]:
     """The readings after each frame, given the body's pose, its gyro bias and false acceleration then."""
     if len(recording.t) < 2:
         raise DataError(f"{recording.name}: expected at least 2 frames, got {len(recording.t)}")
     if config.imu == "none":
-        empty = no_readings()
-        return lambda i, T_world_ref, gyro_bias, false_acceleration: empty
+        empty = no_imu()
+        return lambda i, T_world_ref, gyro_bias, accelerometer_bias_world: empty
     if recording.imu is None:
         raise DataError(f"{recording.name}: --imu {config.imu} needs inertial readings, and there are none")
     readings, mask = inertial.windows(recording.imu, recording.t)
 
-    def window(i, T_world_ref, gyro_bias, false_acceleration):
-        gravity = jnp.asarray(recording.gravity_world + false_acceleration, jnp.float32)
+    def window(i, T_world_ref, gyro_bias, accelerometer_bias_world):
+        gravity = jnp.asarray(recording.gravity_world + accelerometer_bias_world, jnp.float32)
         local = inertial.Imu(*(jnp.asarray(x, jnp.float32) for x in (
             readings.t[i] - recording.t[i], readings.omega_body[i] - gyro_bias, readings.acceleration_body[i]
         )))  # fmt: skip
-        return integrate(local, jnp.asarray(mask[i]), jnp.asarray(T_world_ref[:3, :3], jnp.float32), gravity)
+        return preintegrate(
+            local, jnp.asarray(mask[i]), jnp.asarray(T_world_ref[:3, :3], jnp.float32), gravity
+        )
 
     return window
 

@@ -16,7 +16,7 @@ class Frames(NamedTuple):
     T_world_body: Float[np.ndarray, "n 4 4"]
     T_inner: Float[np.ndarray, "n 4 4"]  # motion since the last frame, in the frame `intrinsic`
     lost: Bool[np.ndarray, " n"]  # tracking failed, the pose is the prediction
-    unlike: Bool[np.ndarray, " n"]  # surfaces fit, but colours far worse than usual
+    appearance_outlier: Bool[np.ndarray, " n"]  # surfaces fit, but colours far worse than usual
     uncertain: Bool[np.ndarray, " n"]  # lost, unlike, reckoned from the IMU, or little to hold on to
     mapped: Bool[np.ndarray, " n"]  # the map was made from it
     keyframe: Bool[np.ndarray, " n"]
@@ -45,7 +45,7 @@ class SlamState(NamedTuple):
     velocity_body: Float[np.ndarray, "3"]  # [m/s] at the last frame
     gyro_bias: Float[np.ndarray, "3"]  # [rad/s] in the body (`predict.observe_gyro_bias`)
     gyro_bias_sigma: float
-    false_acceleration: Float[np.ndarray, "3"]  # [m/s^2] in the world (`predict.observe_acceleration`)
+    accelerometer_bias_world: Float[np.ndarray, "3"]  # [m/s^2] in the world (`predict.observe_acceleration`)
     params: Params  # of the tracked field
     key: PRNGKeyArray
     exposure: Float[np.ndarray, "3"]  # of the last image that was tracked (`observe.Image`)
@@ -61,7 +61,7 @@ def no_frames(count: int) -> Frames:
         T_world_body=np.full((count, 4, 4), np.nan),
         T_inner=np.full((count, 4, 4), np.nan),
         lost=no,
-        unlike=no,
+        appearance_outlier=no,
         uncertain=no,
         mapped=no,
         keyframe=no,

@@ -13,12 +13,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from jaxpose.events import Streams, change_residual, level_at
+from jaxpose.events import PixelIndex, change_residual, cumulative_polarity
 from jaxpose.fields import PoseField
 from jaxpose.geometry.camera import Camera
 from jaxpose.scenes import SceneField
 from jaxpose.training.photometric import Depths, draw_depths, pixel_ray, ray_colour
-from jaxpose.training.steps import Trainer, joint, sum_by_chunks
+from jaxpose.training.steps import Trainer, joint, microbatched_sum
 
 Loss = Literal["window", "asynchronous"]
 
@@ -47,9 +47,12 @@ class EventTrainConfig:
 
 
 class EventData(NamedTuple):
-    """Events by pixel, stamps in float32 [s] from the recording's start, and the colours each pixel sees."""
+    """Events by pixel, timestamps in float32 [s] from the recording's start.
 
-    streams: Streams
+    And the colours each pixel sees.
+    """
+
+    streams: PixelIndex
     mask: Float[Array, "pixels 3"]
 
 
@@ -85,7 +88,7 @@ def trainer(
         residual = change_residual(colour(now), colour(before), change, mask, offset=config.offset)
         return jnp.sum(residual**2)
 
-    total = sum_by_chunks(error, min(config.chunk, config.events))
+    total = microbatched_sum(error, min(config.chunk, config.events))
     draw = {"window": window_pairs, "asynchronous": asynchronous_pairs}[config.loss]
 
     def loss(scene_params, pose_params, data, key):
@@ -109,13 +112,13 @@ def trainer(
 
 
 def window_pairs(
-    key: PRNGKeyArray, streams: Streams, span: tuple[float, float], config: EventTrainConfig
+    key: PRNGKeyArray, streams: PixelIndex, span: tuple[float, float], config: EventTrainConfig
 ) -> Compared:
     """Pixels that have changed between two instants, the same for all, and some drawn from all pixels."""
     end_key, length_key, changed_key, any_key = jax.random.split(key, 4)
     end, before = _instants(end_key, length_key, (), span, config)
     pixels = jnp.arange(len(streams.first))
-    at = jax.vmap(level_at, (None, 0, None))
+    at = jax.vmap(cumulative_polarity, (None, 0, None))
     change = at(streams, pixels, end) - at(streams, pixels, before)
     positives = config.events - int(config.events * config.negatives)
     # By inversion of the count of pixels that have changed; if none has, all are as likely.
@@ -130,7 +133,7 @@ def window_pairs(
 
 
 def asynchronous_pairs(
-    key: PRNGKeyArray, streams: Streams, span: tuple[float, float], config: EventTrainConfig
+    key: PRNGKeyArray, streams: PixelIndex, span: tuple[float, float], config: EventTrainConfig
 ) -> Compared:
     """Events, each with an earlier one of its pixel, and pixels drawn from all at two random instants.
 
@@ -151,7 +154,7 @@ def asynchronous_pairs(
     )
     pixel = jax.random.randint(pixel_key, (negatives,), 0, len(streams.first))
     end, start = _instants(end_key, length_key, (negatives,), span, config)
-    at = jax.vmap(level_at, (None, 0, 0))
+    at = jax.vmap(cumulative_polarity, (None, 0, 0))
     change = at(streams, pixel, end) - at(streams, pixel, start)
     others = Compared(pixel, end, start, change, jnp.ones_like(end))
     return Compared(*(jnp.concatenate(pair) for pair in zip(pairs, others, strict=True)))

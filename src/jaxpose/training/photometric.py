@@ -16,7 +16,7 @@ from jaxpose.geometry import se3
 from jaxpose.geometry.camera import Camera, pixel_direction
 from jaxpose.render import Ray, Spacing
 from jaxpose.scenes import SceneField
-from jaxpose.training.steps import Trainer, joint, sum_by_chunks
+from jaxpose.training.steps import Trainer, joint, microbatched_sum
 
 Params = Any
 
@@ -69,7 +69,7 @@ def trainer(
         ray, depth, rgb = item
         return jnp.sum((ray_colour(scene, scene_params, ray, depth)[0] - rgb) ** 2)
 
-    total = sum_by_chunks(error, min(config.chunk, config.rays))
+    total = microbatched_sum(error, min(config.chunk, config.rays))
 
     def loss(scene_params, pose_params, views, key):
         view_key, pixel_key, depth_key = jax.random.split(key, 3)
@@ -128,7 +128,7 @@ def viewer(
             ray, depth, seen = item
             return jnp.sum((ray_colour(scene, scene_params, ray, depth, background)[0] - seen) ** 2)
 
-        total = sum_by_chunks(error, min(config.chunk, config.rays))
+        total = microbatched_sum(error, min(config.chunk, config.rays))
 
         def loss(twist, key):
             pixel_key, depth_key = jax.random.split(key)

@@ -83,7 +83,7 @@ def joint(
     return Trainer(jax.jit(start), jax.jit(advance, static_argnums=2))
 
 
-def sum_by_chunks(
+def microbatched_sum(
     loss: Callable[[Params, Any], Float[Array, ""]], chunk: int
 ) -> Callable[[Params, Batch], Float[Array, ""]]:
     """`total(params, batch)`: the sum of `loss(params, item)` over the items of `batch`, `chunk` at a time.
@@ -103,7 +103,7 @@ def sum_by_chunks(
 
     @jax.custom_vjp
     def total(params, batch):
-        return _over_chunks(lambda items: (summed(params, items), ()), batch, chunk)[0]
+        return _over_microbatches(lambda items: (summed(params, items), ()), batch, chunk)[0]
 
     def forward(params, batch):
         leaves, structure = jax.tree.flatten(batch)
@@ -119,7 +119,7 @@ def sum_by_chunks(
             result, (of_params, of_moved) = jax.value_and_grad(value, argnums=(0, 1))(params, moved)
             return (result, of_params), of_moved
 
-        (result, of_params), of_moved = _over_chunks(of_chunk, leaves, chunk)
+        (result, of_params), of_moved = _over_microbatches(of_chunk, leaves, chunk)
         moved = iter(of_moved)
         of_batch = jax.tree.unflatten(structure, [next(moved) if is_real else None for is_real in real])
         return result, (of_params, of_batch)
@@ -131,7 +131,9 @@ def sum_by_chunks(
     return total
 
 
-def _over_chunks(function: Callable[[Batch], tuple[Any, Any]], batch: Batch, chunk: int) -> tuple[Any, Any]:
+def _over_microbatches(
+    function: Callable[[Batch], tuple[Any, Any]], batch: Batch, chunk: int
+) -> tuple[Any, Any]:
     """Sum of the first results of `function` over chunks of `batch`, and its second results joined."""
     count = len(jax.tree.leaves(batch)[0])
     whole = count - count % chunk

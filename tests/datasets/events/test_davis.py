@@ -30,19 +30,22 @@ def pose_of(t):
 
 @pytest.fixture
 def scene(tmp_path, save):
-    """0.2 s of events; frames every 0.04 s from 0.1 s before to 0.38 s after; truth at 100 Hz around them."""
+    """0.2 s of events; frames every 0.04 s from 0.1 s before to 0.38 s after.
+
+    Ground truth at 100 Hz around them.
+    """
     (tmp_path / "events.txt").write_text("".join(lines_of(*events_of())))
     (tmp_path / "calib.txt").write_text(CALIB)
-    listing, truth = [], []
+    listing, ground_truth = [], []
     for k in range(12):
         pixels = np.random.default_rng(k).integers(0, 256, (48, 64), np.uint8)
         save(tmp_path / f"images/frame_{k:08d}.png", pixels)
         listing.append(f"{T0 - 0.1 + 0.04 * k:.9f} images/frame_{k:08d}.png\n")
     for t in T0 + np.arange(-0.08, 0.23, 0.01):
         position, rotation = pose_of(t)
-        truth.append(" ".join(f"{v:.12f}" for v in (t, *position, *rotation.as_quat())) + "\n")
+        ground_truth.append(" ".join(f"{v:.12f}" for v in (t, *position, *rotation.as_quat())) + "\n")
     (tmp_path / "images.txt").write_text("".join(listing))
-    (tmp_path / "groundtruth.txt").write_text("".join(truth))
+    (tmp_path / "groundtruth.txt").write_text("".join(ground_truth))
     return tmp_path
 
 
@@ -55,7 +58,7 @@ def test_a_made_folder_reads_back(scene):
     np.testing.assert_array_equal(recording.events.polarity, 2 * p - 1)
     assert recording.camera == (60, 61, 31.5, 23.5, 64, 48, (-0.3, 0.1, 0.001, -0.002, 0.05))
     assert recording.mosaic == "mono" and not recording.cyclic and recording.threshold is None
-    # Poses are the truth at its own stamps, on the clock of the events.
+    # Poses are the ground truth at its own timestamps, on the clock of the events.
     assert len(recording.t) == 31
     np.testing.assert_allclose(recording.t, T0 + np.arange(-0.08, 0.23, 0.01) - t[0], atol=3e-7)
     position, rotation = pose_of(T0 - 0.08)
@@ -72,8 +75,8 @@ def test_frames_are_those_of_the_events_time(scene):
     np.testing.assert_array_equal(
         frames.rgb[0, :, :, 1], np.random.default_rng(2).integers(0, 256, (48, 64), np.uint8)
     )
-    for stamp, T in zip(frames.t, frames.T_world_cam, strict=True):
-        position, rotation = pose_of(stamp + t0)
+    for timestamp, T in zip(frames.t, frames.T_world_cam, strict=True):
+        position, rotation = pose_of(timestamp + t0)
         np.testing.assert_allclose(T[:3, 3], position, atol=1e-7)
         np.testing.assert_allclose(T[:3, :3], rotation.as_matrix(), atol=1e-6)
     assert "5 of 12 frames left out, not next to or within the events' time" in recording.notes
@@ -87,12 +90,12 @@ def test_frames_without_truth_are_left_out_aloud(scene):
     file.write_text("".join(file.read_text().splitlines(True)[11:]))
     recording = davis.load(scene)
     assert recording.frames.files[0] == "images/frame_00000004.png"
-    note = "2 frames left out, no true pose around their stamp: frame_00000002.png, frame_00000003.png"
+    note = "2 frames left out, no true pose around their timestamp: frame_00000002.png, frame_00000003.png"
     assert note in recording.notes
     file.unlink()
     recording = davis.load(scene)
     assert recording.frames is None and recording.t.shape == (0,) and recording.T_world_cam.shape == (0, 4, 4)
-    assert "no groundtruth.txt: there is no truth to compare with" in recording.notes
+    assert "no groundtruth.txt: there is no ground truth to compare with" in recording.notes
 
 
 def test_truth_of_another_clock_is_told(scene):
@@ -116,10 +119,12 @@ def test_numbers_may_be_written_as_numpy_does(scene, form):
 
 def test_nanoseconds_since_1970_keep_their_digits(scene):
     t = 1_403_715_524_250_000_000 + np.arange(1000) * 3001
-    (scene / "events.txt").write_text("".join(f"{stamp} 1 2 1\n" for stamp in t))
+    (scene / "events.txt").write_text("".join(f"{timestamp} 1 2 1\n" for timestamp in t))
     recording = davis.load(scene)
     np.testing.assert_allclose(recording.events.t, np.arange(1000) * 3001e-9, rtol=1e-12)
-    assert recording.notes[0].startswith("stamps read as nanoseconds, as in the format's seconds their rate")
+    assert recording.notes[0].startswith(
+        "timestamps read as nanoseconds, as in the format's seconds their rate"
+    )
 
 
 def test_more_events_than_a_block_are_all_read(tmp_path):
@@ -205,7 +210,7 @@ def write(name, text):
             events_with(5, "1403715524.2501 a 2 1\n"),
             r"events.txt:7: expected .*, got '1403715524.2501 a",
         ),
-        (events_with(5, "nan 1 2 1\n"), "events.txt:7: expected a finite stamp, got nan"),
+        (events_with(5, "nan 1 2 1\n"), "events.txt:7: expected a finite timestamp, got nan"),
         (events_with(5, "1403715524.2501 1.5 2 1\n"), "events.txt:7: expected a whole number for x, got 1.5"),
         (events_with(5, "1403715524.2501 1 2 3\n"), "events.txt:7: expected polarities 0 and 1, .*, got 3"),
         (events_with(900, "1403715524.25 1 2 1\n"), "events.txt:902: expected events in the order of time, "),
@@ -215,11 +220,11 @@ def write(name, text):
         (write("groundtruth.txt", "1 2 3\n"), "groundtruth.txt:1: expected a trajectory"),
         (
             write("groundtruth.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n"),
-            "expected poses with stamps .*, got a KITTI",
+            "expected poses with timestamps .*, got a KITTI",
         ),
         (
             write("images.txt", "0.1\n"),
-            "images.txt:1: expected a stamp in seconds and a file name, got ",
+            "images.txt:1: expected a timestamp in seconds and a file name, got ",
         ),
         (write("images/frame_00000003.png", "no"), "frame_00000003.png: expected an image, got "),
         (lambda s: (s / "images/frame_00000003.png").unlink(), "0003.png: expected an image, got nothing"),
@@ -261,8 +266,8 @@ def test_the_real_slice(data_dir):
     assert way[0] > 0.9 and np.abs(way[1:]).max() == 0
     assert recording.frames.files == tuple(f"images/frame_{k:08d}.png" for k in range(1, 6))
     np.testing.assert_allclose(recording.frames.t[0], 0.038766001 - t0, atol=1e-12)
-    truth = np.loadtxt(folder / "groundtruth.txt")
-    at = np.interp(recording.frames.t + t0, truth[:, 0], truth[:, 1])
+    ground_truth = np.loadtxt(folder / "groundtruth.txt")
+    at = np.interp(recording.frames.t + t0, ground_truth[:, 0], ground_truth[:, 1])
     np.testing.assert_allclose(recording.frames.T_world_cam[:, 0, 3], at, atol=2e-4)
     assert recording.notes[0] == "81 of 87 frames left out, not next to or within the events' time"
-    assert recording.notes[1].endswith("no true pose around their stamp: frame_00000000.png")
+    assert recording.notes[1].endswith("no true pose around their timestamp: frame_00000000.png")

@@ -63,7 +63,7 @@ def test_a_made_scene_reads_back(scene):
     assert recording.mosaic == "rggb" and recording.cyclic and recording.threshold is None
     np.testing.assert_allclose(recording.t, np.arange(VIEWS) / (VIEWS - 1) * raw["t"].max() / 1e6)
     np.testing.assert_allclose(recording.T_world_cam, orbit(VIEWS), atol=1e-8)
-    assert recording.notes[0].startswith("stamps read as microseconds: 4000 events in ")
+    assert recording.notes[0].startswith("timestamps read as microseconds: 4000 events in ")
     assert "evenly spaced in time; the last view is next to the first: taken as cyclic" in recording.notes[1]
     assert eventnerf.load(scene / "train", mosaic="mono").mosaic == "mono"
 

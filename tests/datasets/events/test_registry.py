@@ -78,7 +78,7 @@ def test_archives_alone_are_told_of(made):
     assert recording.camera == (640, 640, 319.5, 239.5, 640, 480, ())
     assert "size of the sensor taken as 640x480, the smallest known that fits" in recording.notes
     assert "no calib.txt or camera.json: focal length taken as 640 px, no distortion" in recording.notes
-    assert recording.notes[-1] == "no poses.txt: there is no truth to compare with"
+    assert recording.notes[-1] == "no poses.txt: there is no ground truth to compare with"
     with pytest.raises(DataError, match="camera.json: expected a camera of 9x9, got 64x48"):
         write_camera(folder / "camera.json", Camera(50, 51, 31, 23, 64, 48), (), ".")
         load(folder, size=(9, 9))
@@ -89,7 +89,7 @@ def test_repeated_poses_are_told(made):
     (folder / "poses.txt").write_text(POSES + POSES.splitlines()[1] + "\n")
     recording = load(folder)
     assert len(recording.t) == 2
-    assert "1 lines of poses.txt repeat the stamp before them and are ignored" in recording.notes
+    assert "1 lines of poses.txt repeat the timestamp before them and are ignored" in recording.notes
 
 
 def test_archives_with_bad_events_are_refused(made):
@@ -128,7 +128,7 @@ def test_npz_of_other_names_compressed_and_damaged(tmp_path):
     np.savez_compressed(tmp_path / "a.npz", **{f"{name}s": values for name, values in raw.items()})
     recording = event_npz.load(tmp_path, size=(64, 48))
     np.testing.assert_array_equal(recording.events.x, raw["x"])
-    assert recording.notes[-2].startswith("stamps read as microseconds: 3000 events in 0.1999 s")
+    assert recording.notes[-2].startswith("timestamps read as microseconds: 3000 events in 0.1999 s")
     np.savez(tmp_path / "a.npz", t=raw["t"], x=raw["x"])
     for path in (tmp_path, tmp_path / "a.npz"):
         with pytest.raises(

@@ -21,7 +21,10 @@ def stream_of(*columns, step=1000, unit=None):
 
 @pytest.fixture
 def made():
-    """Stamps in whole microseconds (5 MHz), pixels, and polarities 0 and 1, as arrays that can be changed."""
+    """Timestamps in whole microseconds (5 MHz), pixels, and polarities 0 and 1.
+
+    As arrays that can be changed.
+    """
     g = np.random.default_rng(3)
     t = np.cumsum(g.integers(0, 2, N)) * 2 + 7_000_000
     return [t, g.integers(0, 64, N), g.integers(0, 48, N), g.integers(0, 2, N)]
@@ -83,7 +86,7 @@ def test_units_are_found_and_told(made, unit, word, per_second, since, rate_hz):
         raw = round(since * per_second) + ticks * round(per_second / 1e6)
     events, tally, notes = clean(stream_of(raw, *made[1:]), SIZE)
     assert tally.unit == unit
-    assert len(notes) == 1 and notes[0].startswith(f"stamps read as {word}: {N} events in ")
+    assert len(notes) == 1 and notes[0].startswith(f"timestamps read as {word}: {N} events in ")
     # Seconds since 1970 have no more digits in float64.
     np.testing.assert_allclose(
         events.t, (ticks - ticks[0]) / 1e6, atol=3e-7 if since and unit == "s" else 1e-12
@@ -94,7 +97,7 @@ def test_indices_of_frames_are_found_and_told(made):
     frames = np.sort(np.random.default_rng(0).integers(0, 50, N))
     events, _, notes = clean(stream_of(frames, *made[1:]), SIZE, zero=0)
     np.testing.assert_array_equal(events.t, frames)
-    assert notes == (f"stamps read as frame indices, 1 s each: {N} events in 49 frames",)
+    assert notes == (f"timestamps read as frame indices, 1 s each: {N} events in 49 frames",)
 
 
 def test_a_unit_that_is_given_is_taken(made):
@@ -214,8 +217,8 @@ def test_unusable_events_are_refused(made, change, message):
 @pytest.mark.parametrize(
     ("column", "value", "message"),
     [
-        (0, np.nan, "made.npz: event 1234: expected a finite stamp, got nan"),
-        (0, np.inf, "event 1234: expected a finite stamp, got inf"),
+        (0, np.nan, "made.npz: event 1234: expected a finite timestamp, got nan"),
+        (0, np.inf, "event 1234: expected a finite timestamp, got inf"),
         (1, np.nan, "event 1234: expected a whole number for x, got nan"),
         (1, np.inf, "event 1234: expected a whole number for x, got inf"),
         (2, 10.5, "event 1234: expected a whole number for y, got 10.5"),

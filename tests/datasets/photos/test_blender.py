@@ -145,7 +145,7 @@ def test_stamps_order_the_images(synthetic, key):
     assert train.files[1] == "./images_train/r_7"
     assert held_out.t.tolist() == [0.5, 2.5, 7.5]
     assert_the_point_is_where_it_was_drawn(train)
-    assert not any("stamp" in note for note in train.notes)
+    assert not any("timestamp" in note for note in train.notes)
     for frame in content["frames"]:
         frame[key] = 0
     rewrite(synthetic, "transforms_test.json", content)

@@ -58,9 +58,9 @@ def turned(angle, centre):
 @pytest.mark.parametrize("T", [np.eye(4), turned(0.4, [-0.7, 0.1, 0.3])])
 def test_surfaces_are_where_they_are(points, T):
     depth = depth_from_cloud(CAMERA, points)(T)
-    truth, on_board = expected(T)
+    ground_truth, on_board = expected(T)
     assert depth.shape == (120, 188) and depth.dtype == np.float32
-    error = np.abs(depth - truth) / truth
+    error = np.abs(depth - ground_truth) / ground_truth
     assert (depth > 0).all()
     assert np.median(error) < 0.005 and np.mean(error > 0.03) < 0.06  # silhouettes move by a few pixels
     core = on_board & np.roll(on_board, 4, 0) & np.roll(on_board, -4, 0)

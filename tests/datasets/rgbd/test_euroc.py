@@ -1,4 +1,4 @@
-"""EuRoC's IMU and truth."""
+"""EuRoC's IMU and ground truth."""
 
 from functools import partial
 
@@ -34,14 +34,14 @@ def test_imu_and_its_data_sheet(sequence):
 
 
 def test_truth_is_on_the_clock_of_the_imu(sequence):
-    truth = euroc.load_truth(sequence)
-    np.testing.assert_allclose(truth.t, [1, 1.005], rtol=1e-12)
+    ground_truth = euroc.load_truth(sequence)
+    np.testing.assert_allclose(ground_truth.t, [1, 1.005], rtol=1e-12)
     cyclic = [[0, 0, 1, 1], [1, 0, 0, 2], [0, 1, 0, 3], [0, 0, 0, 1]]  # x to y to z
-    np.testing.assert_allclose(truth.T_world_body[0], cyclic, atol=1e-12)
-    np.testing.assert_allclose(truth.T_world_body[1, :3, :3], np.eye(3), atol=1e-12)
-    np.testing.assert_array_equal(truth.velocity_world[0], [4, 5, 6])
-    np.testing.assert_array_equal(truth.gyro_bias[0], [7, 8, 9])
-    np.testing.assert_array_equal(truth.accelerometer_bias[0], [10, 11, 12])
+    np.testing.assert_allclose(ground_truth.T_world_body[0], cyclic, atol=1e-12)
+    np.testing.assert_allclose(ground_truth.T_world_body[1, :3, :3], np.eye(3), atol=1e-12)
+    np.testing.assert_array_equal(ground_truth.velocity_world[0], [4, 5, 6])
+    np.testing.assert_array_equal(ground_truth.gyro_bias[0], [7, 8, 9])
+    np.testing.assert_array_equal(ground_truth.accelerometer_bias[0], [10, 11, 12])
 
 
 IMU, YAML = "imu0/data.csv", "imu0/sensor.yaml"
@@ -59,12 +59,16 @@ TRUTH = "state_groundtruth_estimate0/data.csv"
         (TRUTH, "\n", f"{TRUTH}: expected lines of 17 columns"),
         (IMU, "#h\n5,1,2,3,4,5,6\n6,1,2,3\n", f"{IMU}:3: expected 7 columns .* got 4"),
         (TRUTH, "5,1,2,3,4,5,6\n", f"{TRUTH}:1: expected 17 columns .* got 7"),
-        (IMU, "5,1,2,3,4,five,6\n", f"{IMU}:1: expected a stamp in ns and numbers, got '5,1,2,3,4,five,6'"),
-        (IMU, "5.5,1,2,3,4,5,6\n", f"{IMU}:1: expected a stamp in ns"),
+        (
+            IMU,
+            "5,1,2,3,4,five,6\n",
+            f"{IMU}:1: expected a timestamp in ns and numbers, got '5,1,2,3,4,five,6'",
+        ),
+        (IMU, "5.5,1,2,3,4,5,6\n", f"{IMU}:1: expected a timestamp in ns"),
         (IMU, "5,1,2,3,4,nan,6\n", f"{IMU}:1: expected finite numbers"),
         (IMU, "5,1,2,3,4,inf,6\n", f"{IMU}:1: expected finite numbers"),
-        (IMU, "5,1,2,3,4,5,6\n5,1,2,3,4,5,6\n", f"{IMU}:2: expected a stamp after 5, got 5"),
-        (IMU, "5,1,2,3,4,5,6\n4,1,2,3,4,5,6\n", f"{IMU}:2: expected a stamp after 5, got 4"),
+        (IMU, "5,1,2,3,4,5,6\n5,1,2,3,4,5,6\n", f"{IMU}:2: expected a timestamp after 5, got 5"),
+        (IMU, "5,1,2,3,4,5,6\n4,1,2,3,4,5,6\n", f"{IMU}:2: expected a timestamp after 5, got 4"),
         (
             TRUTH,
             truth_line(5) + "\n" + truth_line(6, quaternion=(1, 1, 0, 0)),
@@ -100,20 +104,23 @@ def test_no_folder(tmp_path):
 
 @pytest.fixture(scope="module")
 def real(data_dir):
-    """Real readings, on the clock of the truth's first stamp, without the bias that the truth estimates."""
+    """Real readings, on the clock of ground truth's first timestamp.
+
+    Without the bias that the ground truth estimates.
+    """
     path = data_dir / "euroc_V1_02_medium"
-    log, truth = euroc.load_imu(path), euroc.load_truth(path)
+    log, ground_truth = euroc.load_imu(path), euroc.load_truth(path)
     assert log.noise == ADIS16448
-    at = (log.imu.t >= truth.t[0]) & (log.imu.t <= truth.t[-1])
+    at = (log.imu.t >= ground_truth.t[0]) & (log.imu.t <= ground_truth.t[-1])
     imu = Imu(*(values[at] for values in log.imu))
-    bias = lambda values: np.stack([np.interp(imu.t, truth.t, axis) for axis in values.T], axis=1)
+    bias = lambda values: np.stack([np.interp(imu.t, ground_truth.t, axis) for axis in values.T], axis=1)
     unbiased = Imu(
-        imu.t - truth.t[0],
-        imu.omega_body - bias(truth.gyro_bias),
-        imu.acceleration_body - bias(truth.accelerometer_bias),
+        imu.t - ground_truth.t[0],
+        imu.omega_body - bias(ground_truth.gyro_bias),
+        imu.acceleration_body - bias(ground_truth.accelerometer_bias),
     )
-    kept = truth.t <= imu.t[-1] + 0.005
-    return unbiased, truth.t[kept] - truth.t[0], truth.T_world_body[kept]
+    kept = ground_truth.t <= imu.t[-1] + 0.005
+    return unbiased, ground_truth.t[kept] - ground_truth.t[0], ground_truth.T_world_body[kept]
 
 
 @pytest.mark.data

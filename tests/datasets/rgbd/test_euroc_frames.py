@@ -1,4 +1,4 @@
-"""EuRoC's images and depth, with truth and IMU on their clock."""
+"""EuRoC's images and depth, with ground truth and IMU on their clock."""
 
 import shutil
 
@@ -51,16 +51,19 @@ def body_at(seconds):
     return T
 
 
-def write_frames(folder, stamps, images, save):
-    for stamp, image in zip(stamps, images, strict=True):
-        save(folder / f"data/{stamp}.png", image)
-    lines = ["#timestamp [ns],filename", *(f"{stamp},{stamp}.png" for stamp in stamps)]
+def write_frames(folder, timestamps, images, save):
+    for timestamp, image in zip(timestamps, images, strict=True):
+        save(folder / f"data/{timestamp}.png", image)
+    lines = ["#timestamp [ns],filename", *(f"{timestamp},{timestamp}.png" for timestamp in timestamps)]
     (folder / "data.csv").write_text("\r\n".join(lines) + "\r\n")
 
 
 @pytest.fixture
 def vicon(sequence, walk, save):
-    """The made-up recording with two cameras; truth at 200 Hz from 1.02 s on, and depth for all images."""
+    """The made-up recording with two cameras.
+
+    Ground truth at 200 Hz from 1.02 s on, and depth for all images.
+    """
     mav0 = sequence / "mav0"
     write_frames(mav0 / "cam0", STAMPS, walk.rgb[..., 0], save)
     write_frames(mav0 / "cam1", STAMPS[:4], walk.rgb[:4, ..., 1], save)
@@ -69,10 +72,10 @@ def vicon(sequence, walk, save):
     (mav0 / "cam1/sensor.yaml").write_text(sheet)
     write_frames(mav0 / "depth0", STAMPS, walk.counts, save)
     lines = ["#timestamp"]
-    for stamp in range(T0 + 1020000000, T0 + 1400000000, 5000000):
-        T = body_at((stamp - T0) * 1e-9)
+    for timestamp in range(T0 + 1020000000, T0 + 1400000000, 5000000):
+        T = body_at((timestamp - T0) * 1e-9)
         x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
-        lines.append(truth_line(stamp, T[:3, 3].tolist(), (float(w), float(x), float(y), float(z))))
+        lines.append(truth_line(timestamp, T[:3, 3].tolist(), (float(w), float(x), float(y), float(z))))
     (mav0 / "state_groundtruth_estimate0/data.csv").write_text("\n".join(lines))
     return sequence
 
@@ -90,7 +93,7 @@ def test_frames_with_given_depth(vicon, walk, metres):
         np.testing.assert_array_equal(rgb, walk.rgb[i, ..., :1].repeat(3, axis=-1))
         np.testing.assert_allclose(depth, metres(walk.counts[i], 1000), rtol=1e-6)
     assert recording.notes == (
-        f"1 frames without a usable pose (no truth near its stamp): {STAMPS[0]}",
+        f"1 frames without a usable pose (no ground truth near its timestamp): {STAMPS[0]}",
         "cam1 with 4 images is not used",
     )
 
@@ -110,7 +113,7 @@ def test_truth_is_not_interpolated_over_a_gap(vicon):
     file.write_text("\n".join(line for line in lines if line not in away))
     missing = np.isnan(euroc.load(vicon).T_world_cam).all((1, 2))
     np.testing.assert_array_equal(missing, [1, 0, 1, 1, 1, 0])
-    # A stamp that the truth has is known, however far the next one is.
+    # A timestamp that the ground truth has is known, however far the next one is.
     rest = [line for line in lines if line not in away]
     T = body_at((STAMPS[2] - T0) * 1e-9)
     x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat().tolist()
@@ -138,7 +141,7 @@ def test_frames_without_depth_are_left_out(vicon, walk):
     np.testing.assert_allclose(recording.t, np.array([0, 3, 4, 5]) * 0.050000007, rtol=1e-12)
     np.testing.assert_array_equal(recording.read(1).rgb[..., 0], walk.rgb[3, ..., 0])
     assert recording.notes[0] == (
-        f"2 of 6 frames left out, no depth of their stamp: {STAMPS[1]}, {STAMPS[2]}"
+        f"2 of 6 frames left out, no depth of their timestamp: {STAMPS[1]}, {STAMPS[2]}"
     )
 
 
@@ -160,7 +163,7 @@ def test_depth_of_the_scan(vicon, place):
     np.testing.assert_allclose(recording.read(0).depth, 3, atol=1e-4)
     np.testing.assert_allclose(recording.imu.t[0], -1.050000007, rtol=1e-9)
     assert recording.notes == (
-        f"depth from the {len(points) - 1} points of data.ply, taken to be in the frame of the truth",
+        f"depth from the {len(points) - 1} points of data.ply, taken to be in the frame of the ground truth",
         "1 points with NaN or infinity ignored",
         f"1 of 6 frames left out, no true pose to see the cloud from: {STAMPS[0]}",
         "cam1 with 4 images is not used",
@@ -194,14 +197,18 @@ SHEET = CAMERA_SHEET.format(pose="1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1")
     ("file", "content", "message"),
     [
         ("cam0/data.csv", None, "cam0/data.csv: expected a file, got none"),
-        ("cam0/data.csv", "#header\n", "cam0/data.csv: expected lines of a stamp and a file name, got none"),
+        (
+            "cam0/data.csv",
+            "#header\n",
+            "cam0/data.csv: expected lines of a timestamp and a file name, got none",
+        ),
         (
             "cam0/data.csv",
             "#h\n1.5,a.png\n",
-            "cam0/data.csv:2: expected a stamp in ns and a file name, got '1.5",
+            "cam0/data.csv:2: expected a timestamp in ns and a file name, got '1.5",
         ),
-        ("cam0/data.csv", "5\n", "cam0/data.csv:1: expected a stamp in ns and a file name"),
-        ("cam0/data.csv", "5,a.png\n5,b.png\n", "cam0/data.csv:2: expected a stamp after 5, got 5"),
+        ("cam0/data.csv", "5\n", "cam0/data.csv:1: expected a timestamp in ns and a file name"),
+        ("cam0/data.csv", "5,a.png\n5,b.png\n", "cam0/data.csv:2: expected a timestamp after 5, got 5"),
         ("cam0/data.csv", "5,a.png\n", "cam0/data/a.png: expected an image, got nothing"),
         ("cam0/sensor.yaml", None, "cam0/sensor.yaml: expected a file, got none"),
         (
@@ -216,7 +223,7 @@ SHEET = CAMERA_SHEET.format(pose="1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1")
             "yaml: expected the images' res.*, 32x24",
         ),
         ("cam0/sensor.yaml", SHEET.replace("20.5,", ""), "yaml:10: expected intrinsics with 4 numbers, got"),
-        ("depth0/data.csv", "5,a.png\n", "depth0/data.csv: expected stamps of cam0, got 5"),
+        ("depth0/data.csv", "5,a.png\n", "depth0/data.csv: expected timestamps of cam0, got 5"),
         ("depth0/data.csv", f"{STAMPS[0]},a.png\n", "depth0/data/a.png: expected an image, got nothing"),
     ],
 )
@@ -260,18 +267,21 @@ def test_real_stereo_pairs(data_dir):
 
 @pytest.mark.data
 def test_real_frames_with_depth(data_dir, tmp_path):
-    """The real folder with made depth beside it: truth that is nearly at rest, IMU before and after."""
+    """The real folder with made depth beside it.
+
+    Ground truth that is nearly at rest, IMU before and after.
+    """
     path = tmp_path / "V1_01_easy"
     shutil.copytree(data_dir / "euroc_V1_01_easy", path)
-    stamps = euroc.load_camera(path).stamps_ns
-    for stamp in stamps:
-        file = path / f"mav0/depth0/data/{stamp}.png"
+    timestamps = euroc.load_camera(path).stamps_ns
+    for timestamp in timestamps:
+        file = path / f"mav0/depth0/data/{timestamp}.png"
         file.parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(np.full((480, 752), 2000, np.uint16)).save(file)
     shutil.copy(path / "mav0/cam0/data.csv", path / "mav0/depth0/data.csv")
     recording = euroc.load(path)
     np.testing.assert_allclose(recording.t, np.arange(5) * 0.05, atol=1e-6)
-    body = np.array([[0.878895, 2.1834, 0.948427]])  # the truth's first line
+    body = np.array([[0.878895, 2.1834, 0.948427]])  # the ground truth's first line
     centre = (recording.T_world_cam @ np.linalg.inv(recording.T_body_cam))[:, :3, 3]
     np.testing.assert_allclose(centre, body.repeat(5, axis=0), atol=1e-3)
     assert recording.imu.t[0] == 0 and recording.imu.t[-1] > 145

@@ -39,14 +39,14 @@ def readings(walk):
 
 
 def csv(path, ns, omega, force):
-    rows = [[stamp, *w, *f] for stamp, w, f in zip(ns, omega.tolist(), force.tolist(), strict=True)]
+    rows = [[timestamp, *w, *f] for timestamp, w, f in zip(ns, omega.tolist(), force.tolist(), strict=True)]
     path.write_text("#timestamp [ns],w,w,w,a,a,a\n" + "\n".join(",".join(map(repr, row)) for row in rows))
     return path
 
 
 @pytest.fixture
 def desk(tmp_path, walk, save):
-    """A plain folder with stamps of 1970 and true poses, the IMU's csv and its mounting beside it."""
+    """A plain folder with timestamps of 1970 and true poses, the IMU's csv and its mounting beside it."""
     folder = tmp_path / "desk"
     for i in range(6):
         save(folder / f"color/{i}.png", walk.rgb[i])
@@ -121,11 +121,11 @@ def test_a_mounting_that_is_none_is_named(tmp_path, text, message):
     [
         ("", ": expected lines of 7 numbers (t wx wy wz ax ay az), got none"),
         ("0 1 2 3 4 5\n", ":1: expected 7 numbers (t wx wy wz ax ay az), got 6"),
-        ("0 1 2 3 4 5 6\n0 1 2 3 4 5 6\n", ":2: expected a stamp after 0.0 s, got 0.0 s"),
+        ("0 1 2 3 4 5 6\n0 1 2 3 4 5 6\n", ":2: expected a timestamp after 0.0 s, got 0.0 s"),
         ("0 1 2 3 4 5 6\n", ": expected at least 2 readings, got 1"),
         ("0 1 2 3 4 5 nan\n", ":1: expected finite numbers"),
-        ("0.5,1,2,3,4,5,6\n", ":1: expected a stamp in ns and numbers, got '0.5,1,2,3,4,5,6'"),
-        ("#t\n1,1,2,3,4,5\n", ":2: expected 7 columns (stamp, 3 rates, 3 accelerations), got 6"),
+        ("0.5,1,2,3,4,5,6\n", ":1: expected a timestamp in ns and numbers, got '0.5,1,2,3,4,5,6'"),
+        ("#t\n1,1,2,3,4,5\n", ":2: expected 7 columns (timestamp, 3 rates, 3 accelerations), got 6"),
     ],
 )
 def test_a_file_of_readings_that_is_none_is_named(tmp_path, text, message):
@@ -138,7 +138,7 @@ def test_a_file_of_readings_that_is_none_is_named(tmp_path, text, message):
 
 def test_readings_of_another_time_are_refused_and_gaps_told(desk, walk):
     ns, (omega, force) = times_ns(), readings(walk)
-    csv(desk / "imu.csv", [stamp + 10**10 for stamp in ns], omega, force)
+    csv(desk / "imu.csv", [timestamp + 10**10 for timestamp in ns], omega, force)
     with pytest.raises(DataError, match=r"imu\.csv: expected readings at the frames, 1403715523\.912 to "):
         load(config(desk))
     moved = load(config(desk, imu_offset_s=-10.0)).recording
@@ -205,11 +205,13 @@ def test_a_real_flight_agrees_with_gravity_as_mounted_and_not_when_turned(data_d
     imu = read_imu(folder / "imu0" / "data.csv")
     np.testing.assert_allclose(imu.t, rows[:, 0] * 1e-9, rtol=0, atol=1e-6)
     np.testing.assert_array_equal(np.hstack([imu.omega_body, imu.acceleration_body]), rows[:, 1:])
-    truth = np.loadtxt(folder / "state_groundtruth_estimate0" / "data.csv", delimiter=",", comments="#")[::40]
-    truth = truth[truth[:, 0] < rows[-1, 0]]
-    T_world_body = np.tile(np.eye(4), (len(truth), 1, 1))
-    T_world_body[:, :3, :3] = Rotation.from_quat(truth[:, [5, 6, 7, 4]]).as_matrix()
-    t = (truth[:, 0] - rows[0, 0]) * 1e-9
+    ground_truth = np.loadtxt(
+        folder / "state_groundtruth_estimate0" / "data.csv", delimiter=",", comments="#"
+    )[::40]
+    ground_truth = ground_truth[ground_truth[:, 0] < rows[-1, 0]]
+    T_world_body = np.tile(np.eye(4), (len(ground_truth), 1, 1))
+    T_world_body[:, :3, :3] = Rotation.from_quat(ground_truth[:, [5, 6, 7, 4]]).as_matrix()
+    t = (ground_truth[:, 0] - rows[0, 0]) * 1e-9
     recording = Recording(
         "V1_02", Camera(1.0, 1.0, 0.0, 0.0, 1, 1), t, lambda i: pytest.fail("no image is needed"),
         T_world_body @ MOUNTING, imu._replace(t=imu.t - rows[0, 0] * 1e-9), MOUNTING,

@@ -45,7 +45,7 @@ def test_images_read_back_in_order(desk, walk, metres):
     np.testing.assert_allclose(recording.t, np.arange(6) / 10)
     assert recording.notes == (
         "no depth_scale: took depth as mm",
-        "no poses.txt: there is no truth to compare with",
+        "no poses.txt: there is no ground truth to compare with",
     )
     for i in range(6):
         rgb, depth = recording.read(i)
@@ -72,7 +72,7 @@ def test_tum_poses_go_by_their_stamps(desk, walk):
     np.testing.assert_array_equal(np.isnan(recording.T_world_cam).all((1, 2)), [0, 0, 0, 1, 0, 0])
     np.testing.assert_allclose(recording.T_world_cam[2], walk.T_world_cam[2], atol=1e-12)
     assert recording.notes[-1].endswith("(none, NaN or infinity): r_9")
-    # Of two lines with one stamp, as published truth has them, the first counts.
+    # Of two lines with one timestamp, as published ground truth has them, the first counts.
     lines = (desk / "poses.txt").read_text().splitlines()
     again = f"{lines[1].split()[0]} 9 9 9 0 0 0 1"
     (desk / "poses.txt").write_text("\n".join([*lines[:2], again, *lines[2:]]))
@@ -151,7 +151,7 @@ def test_unusable_json_is_named(desk, values, message):
     "file, content, message",
     [
         ("times.txt", "1\n2\n", "times.txt: expected 6 lines, one for each image in color/, got 2"),
-        ("times.txt", "1\n2\n3\n3\n4\n5\n", "times.txt:4: expected a stamp after 3 s, got 3 s"),
+        ("times.txt", "1\n2\n3\n3\n4\n5\n", "times.txt:4: expected a timestamp after 3 s, got 3 s"),
         ("times.txt", "1\ntwo\n", "times.txt:2: expected 1 number"),
         (
             "poses.txt",

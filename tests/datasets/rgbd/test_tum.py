@@ -17,15 +17,15 @@ DEPTH_T = COLOR_T + [0.0051, -0.0043, 0.0215, 0.0062, -0.0070, 0.0012]  # the th
 LAYOUT = "rgbd_dataset_freiburg1_desk"
 
 
-def write_list(file, stamps, kind):
+def write_list(file, timestamps, kind):
     lines = [f"# {kind} images", "# file: 'desk.bag'", "# timestamp filename"]
-    file.write_text("\n".join(lines + [f"{t:.6f} {kind}/{t:.6f}.png" for t in stamps]) + "\n")
+    file.write_text("\n".join(lines + [f"{t:.6f} {kind}/{t:.6f}.png" for t in timestamps]) + "\n")
 
 
 def write_truth(file, t, T):
     rows = [
-        [stamp, *pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat()]
-        for stamp, pose in zip(t, T, strict=True)
+        [timestamp, *pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat()]
+        for timestamp, pose in zip(t, T, strict=True)
     ]
     file.write_text("# ground truth\n" + "".join(" ".join(f"{x:.12f}" for x in row) + "\n" for row in rows))
 
@@ -65,13 +65,13 @@ def test_a_made_sequence_reads_back(desk, walk, metres):
     np.testing.assert_allclose(recording.T_world_cam[[0, 1, 2, 4]], walk.T_world_cam[[0, 1, 3, 5]], atol=1e-9)
     assert recording.imu is None
     assert recording.accelerometer is None
-    color, depth, intrinsics, truth = recording.notes
+    color, depth, intrinsics, ground_truth = recording.notes
     assert color == (
         "1 of 6 colour images left out, no depth of their own within 0.02 s: 1305031102.068100.png"
     )
     assert depth.startswith("1 of 6 depth images left out") and "1305031102.089600.png" in depth
     assert intrinsics.endswith("which are for 640x480; the images are 32x24")
-    assert truth == "1 frames without a usable pose (none within 0.02 s): 1305031102.134000"
+    assert ground_truth == "1 frames without a usable pose (none within 0.02 s): 1305031102.134000"
 
 
 # The accelerometer's axes in the camera's.
@@ -126,7 +126,7 @@ def test_the_limit_of_association_is_a_setting(desk):
     assert len(tum.load(desk, max_difference_s=0.04).t) == 6
     assert len(tum.load(desk, max_difference_s=0.005).t) == 2
     with pytest.raises(
-        DataError, match=f"{LAYOUT}: expected colour and depth within 0.001 s, got stamps from"
+        DataError, match=f"{LAYOUT}: expected colour and depth within 0.001 s, got timestamps from"
     ):
         tum.load(desk, max_difference_s=0.001)
 
@@ -136,10 +136,10 @@ def test_an_image_has_one_partner_the_nearest(tmp_path, walk, save):
     generator = np.random.default_rng(3)
     color_t = START + np.cumsum(generator.uniform(0.005, 0.03, 40))
     depth_t = START + np.cumsum(generator.uniform(0.005, 0.03, 40))
-    for kind, stamps, pixels in (("rgb", color_t, walk.rgb[0]), ("depth", depth_t, walk.counts[0])):
-        for t in stamps:
+    for kind, timestamps, pixels in (("rgb", color_t, walk.rgb[0]), ("depth", depth_t, walk.counts[0])):
+        for t in timestamps:
             save(tmp_path / f"{kind}/{t:.6f}.png", pixels)
-        write_list(tmp_path / f"{kind}.txt", stamps, kind)
+        write_list(tmp_path / f"{kind}.txt", timestamps, kind)
     left, right, expected = set(range(40)), set(range(40)), []
     differences = np.abs(np.round(color_t, 6)[:, None] - np.round(depth_t, 6)[None])
     for flat in np.argsort(differences, axis=None):
@@ -182,21 +182,21 @@ def test_without_truth(desk):
     (desk / "groundtruth.txt").unlink()
     recording = tum.load(desk, depth_per_metre=1000.0)
     assert recording.T_world_cam is None
-    assert "no groundtruth.txt: there is no truth to compare with" in recording.notes
+    assert "no groundtruth.txt: there is no ground truth to compare with" in recording.notes
     assert recording.read(0).depth.max() > 25
 
 
 def test_the_first_of_lines_with_one_stamp_counts(desk, walk):
-    """As in the published truth of fr2_desk."""
+    """As in the published ground truth of fr2_desk."""
     file = desk / "groundtruth.txt"
     lines = file.read_text().splitlines()
     last = lines[-1].split()
     file.write_text("\n".join([*lines, " ".join([last[0], "9", "9", "9", *last[4:]])]))
     recording = tum.load(desk)
     np.testing.assert_allclose(recording.T_world_cam[4], walk.T_world_cam[5], atol=1e-9)
-    assert "1 lines of groundtruth.txt repeat the stamp before them and are ignored" in recording.notes
+    assert "1 lines of groundtruth.txt repeat the timestamp before them and are ignored" in recording.notes
     file.write_text("\n".join([*lines, "1 0 0 0 0 0 0 1"]))
-    with pytest.raises(DataError, match=f"groundtruth.txt:{len(lines) + 1}: expected a stamp after"):
+    with pytest.raises(DataError, match=f"groundtruth.txt:{len(lines) + 1}: expected a timestamp after"):
         tum.load(desk)
 
 
@@ -205,17 +205,17 @@ def test_the_first_of_lines_with_one_stamp_counts(desk, walk):
     "name, repeated", [("fr2_desk_groundtruth.txt", 1), ("freiburg1_xyz-groundtruth.txt", 0)]
 )
 def test_real_truth(desk, walk, save, data_dir, name, repeated):
-    """The published files, with images made at the stamps of some of their poses."""
+    """The published files, with images made at the timestamps of some of their poses."""
     shutil.copy(data_dir / "trajectories" / name, desk / "groundtruth.txt")
-    truth = np.loadtxt(desk / "groundtruth.txt")[10::400]
+    ground_truth = np.loadtxt(desk / "groundtruth.txt")[10::400]
     for kind, pixels in (("rgb", walk.rgb[0]), ("depth", walk.counts[0])):
-        for t in truth[:, 0]:
+        for t in ground_truth[:, 0]:
             save(desk / f"{kind}/{t:.6f}.png", pixels)
-        write_list(desk / f"{kind}.txt", truth[:, 0], kind)
+        write_list(desk / f"{kind}.txt", ground_truth[:, 0], kind)
     recording = tum.load(desk)
-    assert any("repeat the stamp" in note for note in recording.notes) == bool(repeated)
-    np.testing.assert_allclose(recording.T_world_cam[:, :3, 3], truth[:, 1:4], atol=1e-12)
-    R = Rotation.from_quat(truth[:, 4:]).as_matrix()
+    assert any("repeat the timestamp" in note for note in recording.notes) == bool(repeated)
+    np.testing.assert_allclose(recording.T_world_cam[:, :3, 3], ground_truth[:, 1:4], atol=1e-12)
+    R = Rotation.from_quat(ground_truth[:, 4:]).as_matrix()
     np.testing.assert_allclose(recording.T_world_cam[:, :3, :3], R, atol=1e-9)
 
 
@@ -225,12 +225,12 @@ FIRST = "rgb/1305031102.000000.png"
 @pytest.mark.parametrize(
     "file, content, message",
     [
-        ("rgb.txt", None, "rgb.txt: expected lines of a stamp and a file name, got nothing"),
-        ("depth.txt", "# nothing\n", "depth.txt: expected lines of a stamp and a file name, got none"),
-        ("rgb.txt", "# a\n1.5\n", "rgb.txt:2: expected a stamp in seconds and a file name, got '1.5'"),
-        ("rgb.txt", "one rgb/1.png\n", "rgb.txt:1: expected a stamp in seconds"),
-        ("rgb.txt", "nan rgb/1.png\n", "rgb.txt:1: expected a stamp in seconds"),
-        ("rgb.txt", "2 a.png\n2 b.png\n", "rgb.txt:2: expected a stamp after 2.0 s, got 2.0 s"),
+        ("rgb.txt", None, "rgb.txt: expected lines of a timestamp and a file name, got nothing"),
+        ("depth.txt", "# nothing\n", "depth.txt: expected lines of a timestamp and a file name, got none"),
+        ("rgb.txt", "# a\n1.5\n", "rgb.txt:2: expected a timestamp in seconds and a file name, got '1.5'"),
+        ("rgb.txt", "one rgb/1.png\n", "rgb.txt:1: expected a timestamp in seconds"),
+        ("rgb.txt", "nan rgb/1.png\n", "rgb.txt:1: expected a timestamp in seconds"),
+        ("rgb.txt", "2 a.png\n2 b.png\n", "rgb.txt:2: expected a timestamp after 2.0 s, got 2.0 s"),
         (FIRST, None, f"{FIRST}: expected an image, got nothing"),
         (FIRST, "text", f"{FIRST}: expected an image, got cannot identify"),
         ("groundtruth.txt", "1 2 3\n", "groundtruth.txt:1: expected a trajectory, TUM .*got '1 2 3'"),

@@ -1,4 +1,7 @@
-"""The orbit made on the fly: its path, its stamps, and its images against rays marched in float64 numpy."""
+"""The orbit made on the fly.
+
+Its path, its timestamps, and its images against rays marched in float64 numpy.
+"""
 
 import jax
 import jax.numpy as jnp

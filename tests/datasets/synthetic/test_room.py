@@ -205,8 +205,8 @@ def body_poses(recording):
 
 
 def test_the_gyroscope_integrates_to_the_truth(exact):
-    rotation, truth = integrated(exact.imu.omega_body, body_poses(exact)), body_poses(exact)[:, :3, :3]
-    error = Rotation.from_matrix(truth).inv() * rotation[::40]
+    rotation, ground_truth = integrated(exact.imu.omega_body, body_poses(exact)), body_poses(exact)[:, :3, :3]
+    error = Rotation.from_matrix(ground_truth).inv() * rotation[::40]
     assert np.degrees(error.magnitude()).max() < 0.01
     assert np.degrees((rotation[0].inv() * rotation).magnitude()).max() > 90
 

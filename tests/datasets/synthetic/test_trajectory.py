@@ -35,7 +35,7 @@ def flight(t, *, height=1.5):
 
 
 def write(folder, *, height=1.5, first=0.5, seconds=5.0):
-    """The flight in EuRoC's layout, the truth from `first` on, readings with a bias."""
+    """The flight in EuRoC's layout, the ground truth from `first` on, readings with a bias."""
     for name in ("imu0", "state_groundtruth_estimate0"):
         (folder / "mav0" / name).mkdir(parents=True)
     with jax.enable_x64(True):
@@ -44,15 +44,15 @@ def write(folder, *, height=1.5, first=0.5, seconds=5.0):
         imu = simulate(pose, t)
         poses = np.asarray(jax.vmap(pose)(t))
     omega, force = np.asarray(imu.omega_body) + BIAS[0], np.asarray(imu.acceleration_body) + BIAS[1]
-    stamps = [T0 + round(s * 1e9) for s in np.asarray(t).tolist()]
+    timestamps = [T0 + round(s * 1e9) for s in np.asarray(t).tolist()]
     readings = np.concatenate([omega, force], axis=1).tolist()
-    rows = [",".join(map(repr, [s, *values])) for s, values in zip(stamps, readings, strict=True)]
+    rows = [",".join(map(repr, [s, *values])) for s, values in zip(timestamps, readings, strict=True)]
     (folder / "mav0/imu0/data.csv").write_text("#header\n" + "\n".join(rows) + "\n")
     (folder / "mav0/imu0/sensor.yaml").write_text(SHEET)
     quaternion = np.roll(Rotation.from_matrix(poses[:, :3, :3]).as_quat(), 1, axis=1)
     rows = [
         ",".join(map(repr, [s, *p[:3, 3].tolist(), *q, *[0.0] * 9]))
-        for s, p, q in zip(stamps, poses, quaternion.tolist(), strict=True)
+        for s, p, q in zip(timestamps, poses, quaternion.tolist(), strict=True)
         if (s - T0) / 1e9 >= first
     ]
     (folder / "mav0/state_groundtruth_estimate0/data.csv").write_text("#header\n" + "\n".join(rows) + "\n")
@@ -122,7 +122,9 @@ def test_an_offset_moves_the_stamps_and_only_those_of_real_readings(flown):
 def test_a_motion_that_no_room_can_hold_is_refused_in_one_line(tmp_path):
     with pytest.raises(DataError, match=r"low: expected a motion above the floor \(z = 0\), got z = 0\.0"):
         trajectory.recorded(write(tmp_path / "low", height=0.21), 5.0, 5.0)
-    with pytest.raises(DataError, match="late: expected two frames at 5 Hz within IMU and truth, got 1"):
+    with pytest.raises(
+        DataError, match="late: expected two frames at 5 Hz within IMU and ground truth, got 1"
+    ):
         trajectory.recorded(write(tmp_path / "late", first=4.9), 5.0, 5.0)
     with pytest.raises(DataError, match="none/mav0/imu0|none.*expected"):
         trajectory.recorded(tmp_path / "none", 5.0, 5.0)

@@ -1,9 +1,9 @@
-"""What a set of data is, and what is wrong with it: stamps, poses, camera, depth, IMU, and how they agree.
+"""What a set of data, and what is wrong with it: timestamps, poses, camera, depth, IMU, and how they agree.
 
 DATA is a folder of an RGB-D recording (7-Scenes, TUM, Replica, ScanNet, EuRoC, plain), of photographs with
-poses (Blender, nerfstudio, LLFF), of an IMU with truth (EuRoC), or of events (DAVIS text, EventNeRF, npz,
-DSEC's HDF5); a trajectory file (TUM, KITTI, EuRoC, 4x4), or a folder of such files. The format is found by
-the files. Ends with 0 if no fault is found, with 2 for warnings, and with 1 for data that cannot be used.
+poses (Blender, nerfstudio, LLFF), of an IMU with ground truth (EuRoC), or of events (DAVIS text, EventNeRF,
+npz, DSEC's HDF5); a trajectory file (TUM, KITTI, EuRoC, 4x4), or a folder of such files. The format is found
+by the files. Ends with 0 if no fault is found, with 2 for warnings, and with 1 for data that cannot be used.
 """
 
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from jaxpose.errors import DataError
 
 _KNOWN = (
     "an RGB-D recording (7-Scenes, TUM, Replica, ScanNet, EuRoC, or color/ and depth/ with intrinsics), "
-    "photographs (transforms.json, transforms_train.json or poses_bounds.npy), mav0/imu0 with truth, "
+    "photographs (transforms.json, transforms_train.json or poses_bounds.npy), mav0/imu0 with ground truth, "
     "events (events*.txt, *.npz, *.h5, or EventNeRF's folders), or trajectories"
 )
 
@@ -101,8 +101,8 @@ def _folder(path: Path) -> tuple[str, Checked]:
         return f"photographs, {name} ({file.name})", check_photographs.check_photographs(path, "blender")
     if (path / "poses_bounds.npy").is_file():
         return "photographs, LLFF (poses_bounds.npy)", check_photographs.check_photographs(path, "llff")
-    if euroc.is_here(path) and not check_inertial.has_depth(path):
-        return "EuRoC, IMU and truth without depth", check_inertial.check_inertial(path)
+    if euroc.detect(path) and not check_inertial.has_depth(path):
+        return "EuRoC, IMU and ground truth without depth", check_inertial.check_inertial(path)
     try:
         form = rgbd_registry.find_format(path)
     except DataError:

@@ -10,7 +10,7 @@ from jaxpose.cli.check.recording import check_camera
 from jaxpose.cli.check.timestamps import check_stamps, read_table
 from jaxpose.cli.check.trajectory import check_trajectory
 from jaxpose.datasets.events import registry as event_registry
-from jaxpose.datasets.events.stream import Stream, Tally, count, listed, reach
+from jaxpose.datasets.events.stream import Stream, StreamStats, count, listed, reach
 from jaxpose.datasets.types import EventRecording
 from jaxpose.errors import DataError
 
@@ -44,7 +44,7 @@ def check_events(path: Path, form: event_registry.Format) -> tuple[str, Checked]
     return name, join(parts)
 
 
-def _events(stream: Stream, tally: Tally, size: tuple[int, int]) -> Checked:
+def _events(stream: Stream, tally: StreamStats, size: tuple[int, int]) -> Checked:
     """Count, rate, polarities and pixels of the first events; what loading refuses is not told here."""
     span = tally.latest - tally.earliest
     rate = tally.count / max(span, 1e-12)
@@ -56,7 +56,7 @@ def _events(stream: Stream, tally: Tally, size: tuple[int, int]) -> Checked:
     if tally.back:
         found = f"{tally.back} earlier than one before, by up to {tally.most_back:.3g} s, "
         found += f"the first at {stream.where(tally.first_back or 0)}"
-        findings.append(Finding("warning", "events", found, "stamps that rise"))
+        findings.append(Finding("warning", "events", found, "timestamps that rise"))
     if tally.outside:
         expected = f"pixels of {size[0]}x{size[1]}"
         findings.append(Finding("warning", "events", reach(tally), expected))
@@ -64,22 +64,22 @@ def _events(stream: Stream, tally: Tally, size: tuple[int, int]) -> Checked:
         expected = "polarities 0 and 1, or -1 and 1"
         findings.append(Finding("warning", "events", f"only {listed(tally.polarities)}", expected))
     if span and (tally.unit != (stream.unit or tally.unit) or not _RATES_HZ[0] < rate < _RATES_HZ[1]):
-        stated = f"100 Hz to 1 GHz of events, stamps in {stream.unit or 's, us or ns'}"
-        found = f"{rate:.3g} Hz with stamps in {tally.unit}"
+        stated = f"100 Hz to 1 GHz of events, timestamps in {stream.unit or 's, us or ns'}"
+        found = f"{rate:.3g} Hz with timestamps in {tally.unit}"
         findings.append(Finding("warning", "unit of time", found, stated))
     ok = Finding("ok", "events", "in order, within the sensor, two polarities")
     return Checked((fact,), tuple(findings) or (ok,))
 
 
 def _beside(folder: Path) -> list[Checked]:
-    """Stamps of frames, and true poses."""
+    """Timestamps of frames, and true poses."""
     parts = []
     if (folder / "images.txt").is_file():
         parts.append(check_stamps("images.txt", read_table(folder / "images.txt")[:, 0], gaps="warning"))
     for file in (folder / "groundtruth.txt", folder / "poses.txt"):
         if file.is_file():
             checked = check_trajectory(file)[1]
-            facts = tuple(fact._replace(name=f"truth {fact.name}") for fact in checked.facts)
+            facts = tuple(fact._replace(name=f"ground truth {fact.name}") for fact in checked.facts)
             parts.append(checked._replace(facts=facts))
     return parts
 

@@ -100,8 +100,8 @@ def _rates(match: _Match, off_deg: float) -> list[Finding]:
         )
     if abs(match.offset_s) > _OFFSET_S:
         late = "late" if match.offset_s > 0 else "early"
-        found = f"stamps of the IMU {1e3 * abs(match.offset_s):.1f} ms {late} against those of the poses"
-        fix = f"add {-match.offset_s:.4f} s to the stamps of the IMU"
+        found = f"timestamps of the IMU {1e3 * abs(match.offset_s):.1f} ms {late} against those of the poses"
+        fix = f"add {-match.offset_s:.4f} s to the timestamps of the IMU"
         findings.append(Finding("warning", "clock offset", found, f"at most {1e3 * _OFFSET_S:g} ms", fix))
     if off_deg > _OFF_DEG:
         found = f"{off_deg:.1f} deg between the axes that the readings have and those stated"

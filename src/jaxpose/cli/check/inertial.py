@@ -1,4 +1,4 @@
-"""Checks of the EuRoC layout's IMU and truth, which need no images."""
+"""Checks of the EuRoC layout's IMU and ground truth, which need no images."""
 
 from pathlib import Path
 from typing import Literal
@@ -32,7 +32,7 @@ def has_depth(path: Path) -> bool:
 
 
 def check_inertial(path: Path) -> Checked:
-    """Stamps, readings and truth, by themselves and against each other."""
+    """Timestamps, readings and ground truth, by themselves and against each other."""
     mav0, parts = sensors(path), []
     for name, gaps in _FILES.items():
         file = mav0 / name / "data.csv"
@@ -47,11 +47,13 @@ def check_inertial(path: Path) -> Checked:
             parts.append(Checked(notes=("no imu0: poses are not tested against readings",)))
         file = next((f for name in _TRUTHS if (f := mav0 / name / "data.csv").is_file()), None)
         if file is not None and log is not None:
-            trajectory = trajectories.read_euroc(file, first_of_equal=True)
+            trajectory = trajectories.read_euroc(file, first_of_repeated=True)
             t, T = trajectory.t - 1e-9 * log.t0_ns, trajectory.T
             parts += [_truth(file, log, t, T), check_imu(log.imu, t, T, log.T_body_imu[:3, :3])]
         elif file is None:
-            parts.append(Checked(notes=(f"no {' or '.join(_TRUTHS)}: there is no truth to compare with",)))
+            parts.append(
+                Checked(notes=(f"no {' or '.join(_TRUTHS)}: there is no ground truth to compare with",))
+            )
     except (DataError, OSError) as error:
         parts.append(unusable(error))
     if not any(part.facts or part.findings for part in parts):
@@ -69,15 +71,18 @@ def _readings(log: euroc.ImuLog) -> Checked:
 def _truth(
     file: Path, log: euroc.ImuLog, t: Float[np.ndarray, " n"], T: Float[np.ndarray, "n 4 4"]
 ) -> Checked:
-    """How much of the readings has truth, and the truth by itself; `t` is by the clock of the readings."""
+    """How much of the readings has ground truth, and ground truth by itself.
+
+    `t` is by the clock of the readings.
+    """
     end = float(np.asarray(log.imu.t)[-1])
     shared = max(0.0, min(end, t[-1]) - max(0.0, t[0]))
     text = f"from {t[0]:.3f} to {t[-1]:.3f} s, IMU from 0 to {end:.3f} s"
-    fact = Fact("truth", text, {"first_s": float(t[0]), "coverage": shared / end if end else 0.0})
+    fact = Fact("ground_truth", text, {"first_s": float(t[0]), "coverage": shared / end if end else 0.0})
     findings = ()
     if shared <= 0:
         fix = "check that both are of one recording, by one clock"
-        findings = (Finding("warning", "truth", text, "truth while the IMU reads", fix),)
+        findings = (Finding("warning", "ground_truth", text, "ground truth while the IMU reads", fix),)
     table = read_table(file)
     values = table[np.append(True, np.diff(table[:, 0]) != 0), 4:8]
     return join([Checked((fact,), findings), check_poses(t, T, Quaternions(values, "wxyz"))])

@@ -43,7 +43,7 @@ def check_poses(
     numbers = {"path_m": float(steps.sum()), "extent_m": float(extent.max())}
     findings = []
     if len(T) > 2 and t is not None:
-        # Motion capture writes some stamps too close together: those make no speed.
+        # Motion capture writes some timestamps too close together: those make no speed.
         speed = steps / np.maximum(np.diff(t), np.median(np.diff(t)))
         fast = float(np.quantile(speed, 0.95))
         text += f", 95% of the speeds below {fast:.3g} m/s"

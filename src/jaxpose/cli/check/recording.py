@@ -1,4 +1,7 @@
-"""Checks of RGB-D recordings: files of stamps, camera, depth, truth, and what of it fits together."""
+"""Checks of RGB-D recordings.
+
+Files of timestamps, camera, depth, ground truth, and what of it fits together.
+"""
 
 from pathlib import Path
 
@@ -27,8 +30,8 @@ def check_recording(path: Path, form: rgbd_registry.Format) -> Checked:
     parts = []
     for name in _STAMPS.get(form, ()):
         if (path / name).is_file() and (table := read_table(path / name)).size:
-            truth = name == "groundtruth.txt"
-            parts.append(check_stamps(name, table[:, 0], gaps="note" if truth else "warning"))
+            ground_truth = name == "groundtruth.txt"
+            parts.append(check_stamps(name, table[:, 0], gaps="note" if ground_truth else "warning"))
     if form == "euroc":
         parts.append(check_inertial(path))
     try:
@@ -70,7 +73,7 @@ def check_camera(camera: Camera) -> Checked:
 
 
 def _stamped(path: Path, form: rgbd_registry.Format) -> bool:
-    """Whether the frames have stamps of their own."""
+    """Whether the frames have timestamps of their own."""
     if form != "plain":
         return form in ("tum", "euroc")
     poses = path / "poses.txt"
@@ -85,7 +88,9 @@ def _frames(recording: Recording, stamped: bool) -> Checked:
     numbers: dict[str, float | str] = {"count": len(t)}
     if len(steps):
         text += f" at {1 / period:.4g} Hz over {t[-1]:.4g} s, largest gap {steps.max():.3g} s"
-        text += f" at {t[steps.argmax()]:.4g} s" + ("" if stamped else "; no stamps, so the rate is assumed")
+        text += f" at {t[steps.argmax()]:.4g} s" + (
+            "" if stamped else "; no timestamps, so the rate is assumed"
+        )
         numbers |= {"rate_hz": 1 / period, "span_s": float(t[-1]), "largest_gap_s": float(steps.max())}
         numbers |= {"largest_gap_at_s": float(t[steps.argmax()]), "stamped": stamped}
     return Checked((Fact("frames", text, numbers),))
@@ -116,9 +121,9 @@ def _depth(recording: Recording) -> Checked:
 
 def _truth(recording: Recording) -> Checked:
     if recording.T_world_cam is None:
-        return Checked((Fact("truth", "none", {"coverage": 0.0}),))
+        return Checked((Fact("ground_truth", "none", {"coverage": 0.0}),))
     finite = np.asarray(np.isfinite(recording.T_world_cam).all((1, 2)))
     t = recording.t[finite]
     text = f"{finite.sum()} of {len(finite)} frames have a pose, from {t[0]:.4g} to {t[-1]:.4g} s"
-    fact = Fact("truth", text, {"coverage": float(finite.mean()), "poses": int(finite.sum())})
+    fact = Fact("ground_truth", text, {"coverage": float(finite.mean()), "poses": int(finite.sum())})
     return join([Checked((fact,)), check_poses(t, recording.T_world_cam[finite])])

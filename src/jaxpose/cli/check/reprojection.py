@@ -120,7 +120,7 @@ def _clock(recording: Recording, views: Views) -> list[Finding]:
     if abs(offset) >= _LEAST_OFFSET_S and share[best] > share[given] + _SAME and wins > 3 * loses:
         side = "later" if offset > 0 else "earlier"
         found = f"images that fit the poses of {1e3 * abs(offset):.0f} ms {side}: "
-        fix = f"add {offset:.2f} s to the stamps of the images"
+        fix = f"add {offset:.2f} s to the timestamps of the images"
         expected = "images and poses by one clock"
         return [Finding("warning", "clock of poses", found + told, expected, fix)]
     return [Finding("ok", "clock of poses", "images fit the poses of their own time best, or as well")]

@@ -1,4 +1,4 @@
-"""Tests of stamps: their order, their unit, and the gaps between them."""
+"""Tests of timestamps: their order, their unit, and the gaps between them."""
 
 from pathlib import Path
 from typing import Literal
@@ -9,12 +9,12 @@ from jaxtyping import Float
 from jaxpose.cli.check.findings import Checked, Fact, Finding
 
 _GAP = 5.0  # median periods
-_MOST_REPEATED = 0.01  # share of the stamps; fewer are left out by the readers without harm
+_MOST_REPEATED = 0.01  # share of the timestamps; fewer are left out by the readers without harm
 _UNITS = {0: "s", -3: "ms", -6: "us", -9: "ns"}
 _PLAUSIBLE_HZ = (0.1, 1e4)  # of what is recorded by a camera, an IMU or motion capture
 _USUAL_HZ = (0.5, 2e3)
 _SINCE_1970 = (1e8, 4e9)  # s, from 1973 to 2096
-_WHOLE_PERIOD = 2.0  # s: stamps that are all whole numbers so far apart count something else
+_WHOLE_PERIOD = 2.0  # s: timestamps that are all whole numbers so far apart count something else
 
 
 def read_table(file: Path) -> Float[np.ndarray, "n c"]:
@@ -37,7 +37,7 @@ def read_table(file: Path) -> Float[np.ndarray, "n c"]:
 def check_stamps(
     what: str, t: Float[np.ndarray, " n"], unit: Literal["s", "ns"] = "s", *, gaps: Literal["note", "warning"]
 ) -> Checked:
-    """Count, rate, span and gaps of stamps `t` [s], which were read as `unit`; tests of order and unit.
+    """Count, rate, span and gaps of timestamps `t` [s], which were read as `unit`; tests of order and unit.
 
     `gaps` says whether a gap is a fault, as in what is integrated or tracked, or just to be told.
     """
@@ -62,7 +62,7 @@ def check_stamps(
             expected = f"{what} about every {period:.3g} s"
             findings.append(Finding("warning", "gaps", found, expected, "cut the recording at the gaps"))
     elif not findings and np.isfinite(period):
-        findings.append(Finding("ok", "stamps", f"{what}: increasing, no gap, plausible in {unit}"))
+        findings.append(Finding("ok", "timestamps", f"{what}: increasing, no gap, plausible in {unit}"))
     return Checked((Fact(what, text, {"count": len(t), **numbers}),), tuple(findings), tuple(notes))
 
 
@@ -72,17 +72,21 @@ def _order(what: str, t: Float[np.ndarray, " n"]) -> list[Finding]:
     back = np.flatnonzero(steps < 0)
     if len(back):
         found = f"{len(back)} that go backwards, the first after {t[back[0]]!s} s (row {back[0] + 2})"
-        findings.append(Finding("error", "stamps", found, f"increasing stamps of {what}", "sort the rows"))
+        findings.append(
+            Finding("error", "timestamps", found, f"increasing timestamps of {what}", "sort the rows")
+        )
     repeated = int((steps == 0).sum())
     if repeated > _MOST_REPEATED * len(t):
         found = f"{repeated} of {len(t)} that repeat the one before"
-        fix = "write stamps with more digits, or leave repeated rows out"
-        findings.append(Finding("warning", "stamps", found, f"a stamp of its own for each of {what}", fix))
+        fix = "write timestamps with more digits, or leave repeated rows out"
+        findings.append(
+            Finding("warning", "timestamps", found, f"a timestamp of its own for each of {what}", fix)
+        )
     return findings
 
 
 def _unit(what: str, t: Float[np.ndarray, " n"], period: float, unit: str) -> list[Finding]:
-    """Stamps that make no sense in the unit that the format has, and the unit in which they would."""
+    """Timestamps that make no sense in the unit that the format has, and the unit in which they would."""
     if len(t) < 2 or not np.isfinite(period):
         return []
     latest = float(np.abs(t).max())
@@ -96,12 +100,12 @@ def _unit(what: str, t: Float[np.ndarray, " n"], period: float, unit: str) -> li
         for power, name in _UNITS.items()
         if name != unit and _USUAL_HZ[0] <= 10.0 ** (own - power) / period <= _USUAL_HZ[1]
     ]
-    found = f"{1 / period:.3g} Hz and stamps up to {latest:.4g} s, read as {unit}"
+    found = f"{1 / period:.3g} Hz and timestamps up to {latest:.4g} s, read as {unit}"
     if fitting:
         actual = min(fitting)[1]
         found += f": they are in {actual}"
-        fix = f"convert the stamps from {actual} to {unit}"
+        fix = f"convert the timestamps from {actual} to {unit}"
     else:
-        fix = "check the unit of the stamps"
+        fix = "check the unit of the timestamps"
     expected = f"{what} in {unit} at {_PLAUSIBLE_HZ[0]:g} to {_PLAUSIBLE_HZ[1]:g} Hz"
     return [Finding("warning", "unit of time", found, expected, fix)]

@@ -30,14 +30,14 @@ def check_trajectory(file: Path) -> tuple[str, Checked]:
         return form, join([*parts, unusable(error)])
     t, T = found.trajectory
     if not found.stamped:
-        fact = Fact("poses", f"{len(t)}, no stamps", {"count": len(t)})
+        fact = Fact("poses", f"{len(t)}, no timestamps", {"count": len(t)})
         return found.format, join([Checked((fact,)), check_poses(None, T)])
     order = "wxyz" if found.format == "EuRoC" else "xyzw"
-    # Of poses with the same stamp the reader keeps the first.
+    # Of poses with the same timestamp the reader keeps the first.
     kept = np.append(True, np.diff(table[:, 0]) != 0)
     notes = ()
     if found.repeated:
-        notes = (f"{found.repeated} poses left out, as they repeat the stamp before them",)
+        notes = (f"{found.repeated} poses left out, as they repeat the timestamp before them",)
     poses = check_poses(t, T, Quaternions(table[kept][: len(T), 4:8], order))
     return found.format, join([*parts, poses, Checked(notes=notes)])
 

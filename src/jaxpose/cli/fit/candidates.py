@@ -146,7 +146,7 @@ def readings(folder: Path, trajectory: Trajectory) -> tuple[Imu, Sensor, tuple[s
     omega, force = (np.asarray(x)[within] for x in (log.imu.omega_body, log.imu.acceleration_body))
     rate_hz = 1 / float(np.median(np.diff(np.asarray(log.imu.t))))
     measured = (sample_noise(omega), sample_noise(force))
-    sensor = Sensor(int(within.sum()), rate_hz, floor(log.noise, rate_hz), measured)
+    sensor = Sensor(int(within.sum()), rate_hz, noise_floor(log.noise, rate_hz), measured)
     notes = ()
     if not within.all():
         notes = (f"{int((~within).sum())} of {len(t)} inertial readings lie outside of the poses: not used",)
@@ -186,7 +186,7 @@ def sample_noise(readings: Float[np.ndarray, "n 3"]) -> float:
     return float(np.sqrt(np.mean(np.diff(readings, 2, axis=0) ** 2) / 6))
 
 
-def floor(noise: ImuNoise, rate_hz: float) -> tuple[float, float]:
+def noise_floor(noise: ImuNoise, rate_hz: float) -> tuple[float, float]:
     """One sigma of a reading by the data sheet: rad/s and m/s^2."""
     return noise.gyro_density * math.sqrt(rate_hz), noise.accelerometer_density * math.sqrt(rate_hz)
 

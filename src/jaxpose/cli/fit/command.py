@@ -32,7 +32,7 @@ class Config:
     trajectory: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="TRAJECTORY")]  # or a run folder
     # Folder in the EuRoC layout whose mav0/imu0 was read by the same clock, in the same body, as the poses.
     imu: Path | None = None
-    rate_hz: float | None = None  # of the poses of a format without stamps
+    rate_hz: float | None = None  # of the poses of a format without timestamps
     posenet_octaves: tuple[int, ...] = (5, 8)  # PoseNets to fit, by the octaves of their time encoding
     posenet_layers: int = 8
     posenet_width: int = 256
@@ -220,15 +220,17 @@ def report(result: Result) -> str:
 
 
 def _trajectory(config: Config) -> tuple[str, Trajectory]:
-    """The poses with their stamps, and what they are in words."""
+    """The poses with their timestamps, and what they are in words."""
     source = read_source(config.trajectory)
     trajectory = source.trajectory
     if not source.stamped:
         if config.rate_hz is None:
-            raise DataError(f"{source.path}: expected --rate-hz, as a {source.what} has no stamps, got none")
+            raise DataError(
+                f"{source.path}: expected --rate-hz, as a {source.what} has no timestamps, got none"
+            )
         trajectory = trajectory._replace(t=trajectory.t / config.rate_hz)
     elif config.rate_hz is not None:
-        raise DataError(f"{source.path}: expected no --rate-hz, as a {source.what} has stamps")
+        raise DataError(f"{source.path}: expected no --rate-hz, as a {source.what} has timestamps")
     if len(trajectory.t) < FEWEST:
         raise DataError(f"{source.path}: expected at least {FEWEST} poses to fit, got {len(trajectory.t)}")
     return str(source), trajectory

@@ -1,4 +1,6 @@
-"""Look at a run in the browser: its path and the truth, cameras with their pictures, map, renders over time.
+"""Look at a run in the browser: its path and ground truth, cameras with their pictures, map.
+
+Renders over time.
 
 RUN is a run folder, or a trajectory file. A slider moves a camera along the run's continuous trajectory and
 shows what the run's map or radiance field shows from there. Nothing is loaded from the network. --save writes

@@ -83,7 +83,7 @@ def _draw(server: viser.ViserServer, scene: Scene, picture: Picture | None) -> A
     thickness = 0.0015 * size_of_all
     _line(add, "/estimate", path, _ESTIMATE, thickness)
     if scene.reference is not None:
-        _line(add, "/truth", scene.reference, _TRUTH, thickness)
+        _line(add, "/ground truth", scene.reference, _TRUTH, thickness)
     if len(scene.keyframes):
         add.add_point_cloud(
             "/keyframes",
@@ -186,7 +186,7 @@ def _panel(
 
     for name, label in (
         ("/estimate", "estimate (blue)"),
-        ("/truth", "truth (red)"),
+        ("/ground truth", "ground truth (red)"),
         ("/keyframes", "keyframes (orange)"),
         ("/frames", "frames"),
         ("/camera", "camera (green)"),

@@ -17,7 +17,7 @@ from jaxpose.experiments.event_nerf import pipeline as event_nerf
 from jaxpose.experiments.noisy_nerf import pipeline as noisy_nerf
 from jaxpose.experiments.slam import map_files
 from jaxpose.geometry.camera import Camera, scale
-from jaxpose.slam.map.texture import painted
+from jaxpose.slam.map.texture import textured
 from jaxpose.training import photometric
 from jaxpose.training.photometric import TrainConfig
 
@@ -25,8 +25,8 @@ from jaxpose.training.photometric import TrainConfig
 def of_map(file: Path, camera: Camera, poses: Poses) -> Render:
     """The map of a SLAM run from where `poses` is at a time, light grey where it has no surface."""
     saved = map_files.read_map(file)
-    look = map_files.viewer(painted(scenes.grid(saved.grid), saved.grid), saved.grid, camera)
-    params = (jnp.asarray(saved.values), jax.tree.map(jnp.asarray, saved.paint))
+    look = map_files.viewer(textured(scenes.grid(saved.grid), saved.grid), saved.grid, camera)
+    params = (jnp.asarray(saved.values), jax.tree.map(jnp.asarray, saved.make_texture))
 
     def render(t: float, width: int) -> Picture:
         return _picture(look(params, poses(np.array([t]))[0], map_files.every(camera, width))[0])

@@ -40,7 +40,7 @@ class Scene(NamedTuple):
     camera: "Camera"
     t: Float[np.ndarray, " n"]  # of the frames
     path: Float[np.ndarray, "m 3"]  # the camera's centre
-    reference: Float[np.ndarray, "k 3"] | None  # that of the truth
+    reference: Float[np.ndarray, "k 3"] | None  # that of the ground truth
     shots: tuple[Shot, ...]
     keyframes: Float[np.ndarray, "j 3"]  # centres; none where the run has no keyframes or does not say
     surface: Path | None  # PLY: a mesh, or else points
@@ -124,17 +124,22 @@ def _camera(source: Source) -> tuple["Camera", tuple[Path, ...], tuple[str, ...]
 
 
 def _reference(source: Source) -> tuple[Float[np.ndarray, "k 3"] | None, tuple[str, ...]]:
-    """The centres of the true poses; moved onto the estimate where the run could not start from the truth."""
+    """The centres of the true poses.
+
+    Moved onto the estimate where the run could not start from ground truth.
+    """
     file = source.path / "reference.txt"
     if not (source.is_run and file.is_file()):
         return None, ()
-    estimate, truth = source.trajectory, trajectories.read_tum(file)
-    if truth.t[0] <= estimate.t[0] + 1e-6:
-        return truth.T[:, :3, 3], ()
-    ours, theirs = trajectories.associate(estimate.t, truth.t, 1e-3)
-    fit = trajectory_error.ate(truth.T[theirs], estimate.T[ours], "se3").alignment
-    note = "the truth begins later than the run, in a world of its own: moved onto the estimate by SE(3)"
-    return trajectory_error.align(fit, truth.T)[:, :3, 3], (note,)
+    estimate, ground_truth = source.trajectory, trajectories.read_tum(file)
+    if ground_truth.t[0] <= estimate.t[0] + 1e-6:
+        return ground_truth.T[:, :3, 3], ()
+    ours, theirs = trajectories.associate(estimate.t, ground_truth.t, 1e-3)
+    fit = trajectory_error.ate(ground_truth.T[theirs], estimate.T[ours], "se3").alignment
+    note = (
+        "the ground truth begins later than the run, in a world of its own: moved onto the estimate by SE(3)"
+    )
+    return trajectory_error.align(fit, ground_truth.T)[:, :3, 3], (note,)
 
 
 def _keyframes(source: Source) -> Float[np.ndarray, "j 3"]:

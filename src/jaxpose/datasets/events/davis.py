@@ -1,4 +1,7 @@
-"""DAVIS text, as the event camera data set has it: lines of `t x y p`, frames, calibration and truth."""
+"""DAVIS text, as the event camera data set has it.
+
+Lines of `t x y p`, frames, calibration and ground truth.
+"""
 
 import warnings
 from collections.abc import Iterator
@@ -22,7 +25,7 @@ _COLUMNS = "4 numbers (t x y p)"
 _EXACT_DIGITS = 15  # of a whole number in float64
 
 
-def is_here(path: Path) -> bool:
+def detect(path: Path) -> bool:
     """Whether a folder has a file of events in text."""
     return any(path.glob("events*.txt"))
 
@@ -37,14 +40,14 @@ def load(
 ) -> EventRecording:
     """Read the folder `path`: `events.txt`, else the only `events*.txt` (or name the file itself).
 
-    Time 0 is the first event's stamp. `calib.txt` is fx fy cx cy k1 k2 p1 p2 k3; the sensor is as large as
-    the images, else `size` (width, height), else as `event_beside.with_camera` says. `groundtruth.txt` has
+    Time 0 is the first event's timestamp. `calib.txt` is fx fy cx cy k1 k2 p1 p2 k3; the sensor is as large
+    as the images, else `size` (width, height), else as `event_beside.with_camera` says. `groundtruth.txt` has
     T_world_cam as `t tx ty tz qx qy qz qw`, given as it is, before and after the events too.
 
-    `frames` are the images of `images.txt` (lines of stamp and file name) during the events, with the one
-    before and the one after; their poses are interpolated, and those without truth around them are left out.
-    Their near and far are a guess from how far the camera moves. What was left out or assumed is told in
-    `notes`; `span`, `unit` and what is refused are those of `event_clean.clean`.
+    `frames` are the images of `images.txt` (lines of timestamp and file name) during the events, with the one
+    before and the one after; their poses are interpolated, and those without ground truth around them are
+    left out. Their near and far are a guess from how far the camera moves. What was left out or assumed is
+    told in `notes`; `span`, `unit` and what is refused are those of `event_clean.clean`.
     """
     source = find(path, size=size)
     folder = source.stream.file.parent
@@ -93,7 +96,7 @@ def _blocks(file: Path) -> Iterator[Block]:
 
 
 def _kind(file: Path) -> np.dtype:
-    """Float64 for all but stamps of so many digits that only integers hold them, as ns since 1970 are."""
+    """Float64 for all but timestamps of so many digits that only integers hold them, as ns since 1970 are."""
     with file.open(encoding="utf-8-sig", errors="replace") as lines:
         first = next((fields for fields in map(_fields, lines) if fields), ["0"])[0]
     whole = first.isdecimal() and len(first) > _EXACT_DIGITS
@@ -146,7 +149,7 @@ def _frames(
         )
     if not posed.all():
         names = [images.files[i].name for i in near[~posed]]
-        notes.append(f"{len(names)} frames left out, no true pose around their stamp: {some(names)}")
+        notes.append(f"{len(names)} frames left out, no true pose around their timestamp: {some(names)}")
     rows = near[posed]
     if not len(rows):
         return None, tuple(notes)

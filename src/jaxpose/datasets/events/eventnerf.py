@@ -36,7 +36,7 @@ class _Views(NamedTuple):
     notes: tuple[str, ...]
 
 
-def is_here(path: Path) -> bool:
+def detect(path: Path) -> bool:
     """Whether a folder is a split with events, or a scene with one to train on."""
     return _training(path) is not None
 
@@ -51,9 +51,9 @@ def load(
 ) -> EventRecording:
     """Read the scene folder `path` (its split `train` or `train1`), or the folder of a split with events.
 
-    View i of n is at i / (n - 1) of the last stamp, as EventNeRF has it; time 0 is the stamp 0. Poses are
-    camera-to-world in OpenCV's axes; intrinsics are the same in all views, 4x4, or 5x4 with k1 and k2 in the
-    last row, and count from the outer corner of the first pixel. The files do not say whether pixels are
+    View i of n is at i / (n - 1) of the last timestamp, as EventNeRF has it; time 0 is the timestamp 0. Poses
+    are camera-to-world in OpenCV's axes; intrinsics are the same in all views, 4x4, or 5x4 with k1 and k2 in
+    the last row, and count from the outer corner of the first pixel. The files do not say whether pixels are
     coloured: `mosaic` does. The sensor is as large as the images of `rgb/`, else `size` (width, height), else
     346x260 with a note. The motion is cyclic if the last view is no farther from the first, in position and
     in angle, than twice the median step between views, of which there are eight or more.
@@ -70,7 +70,7 @@ def load(
     stream = npz_stream(_event_file(split))
     events, tally, told = clean(stream, (camera.width, camera.height), unit=unit, zero=0)
     if tally.latest <= 0:
-        raise DataError(f"{stream.file}: expected stamps from 0 on, got {tally.latest:g} s as the last")
+        raise DataError(f"{stream.file}: expected timestamps from 0 on, got {tally.latest:g} s as the last")
     count = len(views.T_world_cam)
     if count < 2:
         raise DataError(f"{split / 'pose'}: expected at least 2 views, got {count}")
@@ -203,7 +203,7 @@ def _held_out(split: Path) -> tuple[Photographs | None, tuple[str, ...]]:
             continue
         views = _read_views(other, None)
         rgb, _, camera = read_images(views.images, views.camera, stated="the size of the first", width=None)
-        t, stamps = frame_numbers([file.name for file in views.images])
+        t, timestamps = frame_numbers([file.name for file in views.images])
         distance = np.linalg.norm(views.T_world_cam[:, :3, 3], axis=1)
         photographs = Photographs(
             name=name_of(other),
@@ -215,7 +215,7 @@ def _held_out(split: Path) -> tuple[Photographs | None, tuple[str, ...]]:
             far=float(distance.max()) + 1,
             spacing="depth",
             files=tuple(f"rgb/{file.name}" for file in views.images),
-            notes=(stamps,),
+            notes=(timestamps,),
         )
         return photographs, (f"{len(t)} views held out, of {name}",)
     return None, ("no images in a split test or validation: no views are held out",)

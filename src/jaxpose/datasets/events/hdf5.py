@@ -19,7 +19,7 @@ _FOLDERS = (".", "events/left", "left")  # in DSEC each camera has its own
 _OTHERS = ("rectify_map.h5",)  # of DSEC, with no events in it
 
 
-def is_here(path: Path) -> bool:
+def detect(path: Path) -> bool:
     """Whether a folder has an HDF5 file, itself or where DSEC puts that of the left camera."""
     return bool(_files(path))
 
@@ -35,15 +35,15 @@ def load(
     """Read an HDF5 file of DSEC's layout, or the only one in the folder `path` or its `events/left`.
 
     `events/` has x, y, p and t, t in microseconds, to which `t_offset` is added where there is one; time 0
-    is the first event's stamp. `ms_to_idx` is not used. Pixels are as recorded, not rectified. In the folder
-    of the file may lie `poses.txt`, T_world_cam in TUM's format on the clock of t + t_offset, and the camera
-    (`event_beside.with_camera`; it also says what `size` is for). What was left out or assumed is told in
-    `notes`; `span`, `unit` and what is refused are those of `event_clean.clean`. Needs h5py and hdf5plugin
+    is the first event's timestamp. `ms_to_idx` is not used. Pixels are as recorded, not rectified. In the
+    folder of the file may lie `poses.txt`, T_world_cam in TUM's format on the clock of t + t_offset, and the
+    camera (`event_beside.with_camera`; it also says what `size` is for). What was left out or assumed is told
+    in `notes`; `span`, `unit` and what is refused are those of `event_clean.clean`. Needs h5py and hdf5plugin
     (extra `hdf5`); DataError without them.
     """
     source = find(path, size=size)
-    truth = source.stream.file.parent / "poses.txt"
-    return load_source(source, truth, mosaic=mosaic, unit=unit, span=span)[0]
+    ground_truth = source.stream.file.parent / "poses.txt"
+    return load_source(source, ground_truth, mosaic=mosaic, unit=unit, span=span)[0]
 
 
 def find(path: Path | str, *, size: tuple[int, int] | None = None) -> Source:

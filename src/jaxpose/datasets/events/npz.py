@@ -20,7 +20,7 @@ _NAMES = (("t", "x", "y", "p"), ("ts", "xs", "ys", "ps"))
 _DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, ValueError, KeyError, NotImplementedError)
 
 
-def is_here(path: Path) -> bool:
+def detect(path: Path) -> bool:
     """Whether a folder has an archive with the four arrays."""
     return any(_names(file) is not None for file in path.glob("*.npz"))
 
@@ -35,14 +35,14 @@ def load(
 ) -> EventRecording:
     """Read an npz file with arrays x, y, t, p (or xs, ys, ts, ps), or the only one in the folder `path`.
 
-    Time 0 is the first event's stamp. In the same folder may lie `poses.txt`, T_world_cam in TUM's format on
-    the clock of the events, and the camera (`event_beside.with_camera`; it also says what `size` is for).
+    Time 0 is the first event's timestamp. In the same folder may lie `poses.txt`, T_world_cam in TUM's format
+    on the clock of the events, and the camera (`event_beside.with_camera`; it also says what `size` is for).
     What was left out or assumed is told in `notes`; `span`, `unit` and what is refused are those of
     `event_clean.clean`.
     """
     source = find(path, size=size)
-    truth = source.stream.file.parent / "poses.txt"
-    return load_source(source, truth, mosaic=mosaic, unit=unit, span=span)[0]
+    ground_truth = source.stream.file.parent / "poses.txt"
+    return load_source(source, ground_truth, mosaic=mosaic, unit=unit, span=span)[0]
 
 
 def find(path: Path | str, *, size: tuple[int, int] | None = None) -> Source:

@@ -20,7 +20,7 @@ Format = Literal["eventnerf", "davis", "hdf5", "npz"]
 class _Module(Protocol):
     """What the module of a layout has."""
 
-    is_here: Callable[[Path], bool]
+    detect: Callable[[Path], bool]
     find: Callable[..., Source]
     load: Callable[..., EventRecording]
 
@@ -51,11 +51,7 @@ def find_format(path: Path | str) -> Format:
     path = Path(path)
     for name in get_args(Format):
         layout = _LAYOUTS[name]
-        if (
-            layout.module.is_here(path)
-            if path.is_dir()
-            else path.is_file() and path.suffix in layout.suffixes
-        ):
+        if layout.module.detect(path) if path.is_dir() else path.is_file() and path.suffix in layout.suffixes:
             return name
     expected = ", or ".join(f"{layout.files} ({name})" for name, layout in _LAYOUTS.items())
     raise DataError(f"{path}: expected a recording of events, {expected}, got {found(path)}")
@@ -78,8 +74,8 @@ def load(
     """Read a recording of events in the layout `format`, or in the one that `find_format` finds.
 
     `mosaic` is the colour of the pixels: without it "rggb" for EventNeRF's layout, else "mono". `size`
-    (width, height) is that of the sensor where no file tells it, `unit` that of the stamps, and `span` [s]
-    the part to read; see the loaders, whose errors these are.
+    (width, height) is that of the sensor where no file tells it, `unit` that of the timestamps, and `span`
+    [s] the part to read; see the loaders, whose errors these are.
     """
     layout = _LAYOUTS[format or find_format(path)]
     return layout.module.load(path, mosaic=mosaic or layout.mosaic, size=size, unit=unit, span=span)

@@ -34,20 +34,20 @@ class Source(NamedTuple):
 
 
 def load_source(
-    source: Source, truth: Path, *, mosaic: Mosaic, unit: Unit | None, span: tuple[float, float] | None
+    source: Source, ground_truth: Path, *, mosaic: Mosaic, unit: Unit | None, span: tuple[float, float] | None
 ) -> tuple[EventRecording, float]:
     """The events with their camera and the poses of a file, and time 0 on the clock of the files [s].
 
-    Time 0 is the first event's stamp; the poses are all those of `truth`, at their own stamps, or none where
-    there is no such file. Other arguments and errors as `clean` and `check_mosaic` say.
+    Time 0 is the first event's timestamp; the poses are all those of `ground truth`, at their own timestamps,
+    or none where there is no such file. Other arguments and errors as `clean` and `check_mosaic` say.
     """
     check_mosaic(mosaic)
     stream, camera, assumed = source
     events, tally, told = clean(stream, (camera.width, camera.height), unit=unit, span=span)
     zero_s = seconds(tally)
-    poses, lacking = _read_truth(truth, zero_s, (float(events.t[0]), float(events.t[-1])))
+    poses, lacking = _read_truth(ground_truth, zero_s, (float(events.t[0]), float(events.t[-1])))
     recording = EventRecording(
-        name=name_of(truth.parent),
+        name=name_of(ground_truth.parent),
         camera=camera,
         mosaic=mosaic,
         events=events,
@@ -120,17 +120,17 @@ def _read_truth(file: Path, zero_s: float, span: tuple[float, float]) -> tuple[T
     """All poses of a trajectory file on the clock of the events, and notes on it."""
     if not file.is_file():
         none = Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
-        return none, (f"no {file.name}: there is no truth to compare with",)
-    truth, form, stamped, repeated = read_trajectory(file)
+        return none, (f"no {file.name}: there is no ground truth to compare with",)
+    ground_truth, form, stamped, repeated = read_trajectory(file)
     if not stamped:
-        raise DataError(f"{file}: expected poses with stamps (TUM or EuRoC), got a {form} file")
-    t = truth.t - zero_s
+        raise DataError(f"{file}: expected poses with timestamps (TUM or EuRoC), got a {form} file")
+    t = ground_truth.t - zero_s
     notes = []
     if repeated:
-        notes.append(f"{repeated} lines of {file.name} repeat the stamp before them and are ignored")
+        notes.append(f"{repeated} lines of {file.name} repeat the timestamp before them and are ignored")
     if t[-1] < span[0] or t[0] > span[1]:
         notes.append(
             f"no true pose in the time of the events, {span[0]:.4g} to {span[1]:.4g} s: those of {file.name} "
             f"are from {t[0]:.4g} to {t[-1]:.4g} s, so the clocks may differ"
         )
-    return Trajectory(t, truth.T), tuple(notes)
+    return Trajectory(t, ground_truth.T), tuple(notes)

@@ -9,7 +9,7 @@ from jaxtyping import Bool
 
 from jaxpose.errors import DataError
 
-Unit = Literal["s", "us", "ns", "frames"]  # of stamps; "frames": indices, of which one is taken for 1 s
+Unit = Literal["s", "us", "ns", "frames"]  # of timestamps; "frames": indices, of which one is taken for 1 s
 
 BLOCK = 1 << 17  # events that are held in the file's own types at a time
 _PER_SECOND: dict[Unit, float] = {"s": 1.0, "us": 1e6, "ns": 1e9, "frames": 1.0}
@@ -35,11 +35,11 @@ class Stream(NamedTuple):
     unit: Unit | None = None  # that the format states
 
 
-class Tally(NamedTuple):
+class StreamStats(NamedTuple):
     """What a stream holds, counted before anything is left out or refused."""
 
-    unit: Unit  # of the stamps
-    zero: float | int  # the stamp that is time 0
+    unit: Unit  # of the timestamps
+    zero: float | int  # the timestamp that is time 0
     count: int = 0
     earliest: float = np.inf  # [s]
     latest: float = -np.inf
@@ -53,9 +53,9 @@ class Tally(NamedTuple):
     first_back: int | None = None
 
 
-def tallied(
+def stream_stats(
     stream: Stream, size: tuple[int, int], unit: Unit | None, zero: int | None
-) -> Iterator[tuple[Tally, Block]]:
+) -> Iterator[tuple[StreamStats, Block]]:
     """Blocks with t in seconds (float64), and what was counted up to and with each."""
     tally, seen = None, 0
     for block in stream.blocks():
@@ -65,7 +65,7 @@ def tallied(
         block = block._replace(t=block.t.astype(np.float64 if block.t.dtype.kind == "f" else np.int64))
         if tally is None:
             first = zero if zero is not None else block.t[0].item()
-            tally = Tally(unit or _possible(block.t, stream.unit) or find_unit(block.t), first)
+            tally = StreamStats(unit or _possible(block.t, stream.unit) or find_unit(block.t), first)
         # Integers as integers: float64 has not the digits for nanoseconds since 1970.
         t = (block.t - block.t.dtype.type(tally.zero)).astype(np.float64) / _PER_SECOND[tally.unit]
         block = block._replace(t=t)
@@ -74,13 +74,13 @@ def tallied(
         yield tally, block
 
 
-def count(stream: Stream, size: tuple[int, int], *, most: int) -> Tally:
+def count(stream: Stream, size: tuple[int, int], *, most: int) -> StreamStats:
     """What the first events of a stream hold, `most` or a little more, faults included.
 
     DataError as `clean` for what is no number, NaN, or no event at all; nothing else is refused.
     """
     tally = None
-    for tally, _ in tallied(stream, size, None, None):
+    for tally, _ in stream_stats(stream, size, None, None):
         if tally.count >= most:
             break
     if tally is None:
@@ -93,7 +93,7 @@ def inside(block: Block, size: tuple[int, int]) -> Bool[np.ndarray, " n"]:
     return (block.x >= 0) & (block.x < size[0]) & (block.y >= 0) & (block.y < size[1])
 
 
-def reach(tally: Tally) -> str:
+def reach(tally: StreamStats) -> str:
     """The pixels that events fall on, in words."""
     low = f"from {tally.low[0]}, {tally.low[1]} " if min(tally.low) < 0 else "up "
     return f"{low}to {tally.high[0]}, {tally.high[1]}"
@@ -105,12 +105,12 @@ def listed(polarities: frozenset[float]) -> str:
 
 
 def find_unit(t: np.ndarray) -> Unit:
-    """The unit of the stamps of consecutive events, by their size and by how many of them fall on a unit.
+    """The unit of the timestamps of consecutive events, by their size and by how many of them fall on a unit.
 
-    From 1e17 on they are nanoseconds, from 1e14 microseconds since 1970. Stamps with fractions are seconds
-    from 1 event per unit on. Whole ones are frame indices from 30 events per unit on within a span of up to
-    1e5 units; nanoseconds if a hundred or more are all whole thousands, as sensors count microseconds. What
-    is left is microseconds from 1e-3 events per unit on (1 kHz), and nanoseconds below.
+    From 1e17 on they are nanoseconds, from 1e14 microseconds since 1970. Timestamps with fractions are
+    seconds from 1 event per unit on. Whole ones are frame indices from 30 events per unit on within a span of
+    up to 1e5 units; nanoseconds if a hundred or more are all whole thousands, as sensors count microseconds.
+    What is left is microseconds from 1e-3 events per unit on (1 kHz), and nanoseconds below.
     """
     span, latest = float(t.max()) - float(t.min()), float(np.abs(t).max())
     rate = len(t) / span if span else np.inf
@@ -126,12 +126,12 @@ def find_unit(t: np.ndarray) -> Unit:
     return "us" if rate >= 1e-3 else "ns"
 
 
-def seconds(tally: Tally) -> float:
+def seconds(tally: StreamStats) -> float:
     """Time 0 on the clock of the file [s]."""
     return float(tally.zero) / _PER_SECOND[tally.unit]
 
 
-def _add(tally: Tally, block: Block, size: tuple[int, int], seen: int) -> Tally:
+def _add(tally: StreamStats, block: Block, size: tuple[int, int], seen: int) -> StreamStats:
     """The tally with one more block, which begins with event `seen`."""
     t, x, y, polarity = block
     # How far each event lies behind the latest of those before it.
@@ -168,7 +168,7 @@ def _check_numbers(stream: Stream, block: Block, seen: int) -> None:
             usable &= np.isfinite(values)
             if not usable.all():
                 row = int(usable.argmin())
-                wanted = "a finite stamp" if name == "t" else f"a whole number for {name}"
+                wanted = "a finite timestamp" if name == "t" else f"a whole number for {name}"
                 raise DataError(f"{stream.where(seen + row)}: expected {wanted}, got {values[row]:g}")
 
 

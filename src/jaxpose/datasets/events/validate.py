@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxpose.datasets.events.stream import Stream, Tally, Unit, inside, listed, reach, tallied
+from jaxpose.datasets.events.stream import Stream, StreamStats, Unit, inside, listed, reach, stream_stats
 from jaxpose.errors import DataError
 from jaxpose.events import Events
 
@@ -23,7 +23,7 @@ class Read(NamedTuple):
     """Events in order, what was counted on the way, and what the user has to know."""
 
     events: Events
-    tally: Tally
+    tally: StreamStats
     notes: tuple[str, ...]
 
 
@@ -37,19 +37,19 @@ def clean(
 ) -> Read:
     """The events of a stream, or those from span[0] to before span[1] [s], in 13 bytes each.
 
-    Time 0 is the stamp `zero`, else the first in the file. Stamps are in `unit`; without it in the unit that
-    the format states or, if that gives no possible rate, that `find_unit` finds, which a note then says.
-    Polarities are 0 and 1, or -1 and 1. Events outside the sensor of `size` (width, height) are left out and
-    counted in a note; more than 10% of them are refused. Up to 1% may be earlier than one before, by up to
-    10 ms (of indices: 1), as readout mixes them: they are sorted, equal stamps in the order of the file, and
-    counted in a note; more is refused. Events that repeat others are kept.
+    Time 0 is the timestamp `zero`, else the first in the file. Timestamps are in `unit`; without it in the
+    unit that the format states or, if that gives no possible rate, that `find_unit` finds, which a note then
+    says. Polarities are 0 and 1, or -1 and 1. Events outside the sensor of `size` (width, height) are left
+    out and counted in a note; more than 10% of them are refused. Up to 1% may be earlier than one before, by
+    up to 10 ms (of indices: 1), as readout mixes them: they are sorted, equal timestamps in the order of the
+    file, and counted in a note; more is refused. Events that repeat others are kept.
 
     DataError naming file and line (or event) for what is refused, for NaN and infinity, for pixels that are
     no whole numbers, and for no event at all; ValueError for a span that does not rise.
     """
     check_span(span)
     tally, columns = None, ([], [], [], [])
-    for tally, block in tallied(stream, size, unit, zero):
+    for tally, block in stream_stats(stream, size, unit, zero):
         if tally.odd is not None:
             break
         kept = inside(block, size)
@@ -90,7 +90,7 @@ def _joined(column: list[np.ndarray]) -> np.ndarray:
     return whole
 
 
-def _refuse(stream: Stream, size: tuple[int, int], tally: Tally | None) -> None:
+def _refuse(stream: Stream, size: tuple[int, int], tally: StreamStats | None) -> None:
     """DataError for polarities, pixels and an order that cannot be meant."""
     if tally is None:
         return
@@ -112,12 +112,12 @@ def _refuse(stream: Stream, size: tuple[int, int], tally: Tally | None) -> None:
         )
 
 
-def _notes(stream: Stream, size: tuple[int, int], unit: Unit | None, tally: Tally) -> tuple[str, ...]:
+def _notes(stream: Stream, size: tuple[int, int], unit: Unit | None, tally: StreamStats) -> tuple[str, ...]:
     """What was guessed, left out and sorted."""
     notes = []
     if unit is None and tally.unit != stream.unit:
         span = tally.latest - tally.earliest
-        note = f"stamps read as {_WORDS[tally.unit]}"
+        note = f"timestamps read as {_WORDS[tally.unit]}"
         if stream.unit is not None:
             note += f", as in the format's {_WORDS[stream.unit]} their rate would be impossible"
         if tally.unit == "frames":

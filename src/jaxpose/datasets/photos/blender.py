@@ -58,7 +58,7 @@ def load(path: Path | str, *, width: int | None = None) -> tuple[Photographs, Ph
     frame is a file path, with or without suffix, and a camera-to-world pose in OpenGL axes; a frame without
     its image is skipped and counted in `notes`. All frames share one camera: a focal length (`fl_x`) or an
     opening angle (`camera_angle_x`), optionally centre, size and OpenCV's lens. Images are resized by area to
-    `width`. Stamps are the frames' `time` or `timestamp` [s] if each has its own, else frame numbers.
+    `width`. Timestamps are the frames' `time` or `timestamp` [s] if each has its own, else frame numbers.
 
     The depth range is the file's `near` and `far` if it states them, 2 to 6 for Blender's cameras at about 4
     from the object, else a guess from where the cameras look, which `notes` tells. DataError naming the file
@@ -138,12 +138,12 @@ def _find(file: Path, name: str) -> Path | None:
 
 
 def _times(file: Path, frames: list[dict[str, Any]]) -> tuple[Float[np.ndarray, " n"], bool, tuple[str, ...]]:
-    """Time of each frame, whether these are stamps, and what to tell about them."""
+    """Time of each frame, whether these are timestamps, and what to tell about them."""
     for key in ("time", "timestamp"):
         if any(key in frame for frame in frames):
-            stamps = [_number(file, frame, key) if key in frame else math.nan for frame in frames]
-            if len(set(stamps)) == len(stamps) and np.isfinite(stamps).all():
-                return np.array(stamps), True, ()
+            timestamps = [_number(file, frame, key) if key in frame else math.nan for frame in frames]
+            if len(set(timestamps)) == len(timestamps) and np.isfinite(timestamps).all():
+                return np.array(timestamps), True, ()
             t, note = frame_numbers([frame["file_path"] for frame in frames])
             return t, False, (f"{file.name}: {key} is not each frame's own, so not used", note)
     t, note = frame_numbers([frame["file_path"] for frame in frames])

@@ -45,7 +45,7 @@ def read_images(
 
 
 def frame_numbers(names: Sequence[str]) -> tuple[Float[np.ndarray, " n"], str]:
-    """Times of images without stamps, which are in order already, and a note that says what they are.
+    """Times of images without timestamps, which are in order already, and a note that says what they are.
 
     It is the last number of the file names, if they differ in nothing else and it increases, so that frames
     that were left out leave their gap; else 0, 1, 2 and so on.
@@ -55,8 +55,8 @@ def frame_numbers(names: Sequence[str]) -> tuple[Float[np.ndarray, " n"], str]:
     numbers = np.array([float(part[2]) for part in kept])
     same = len(kept) == len(names) and len({(part[1], part[3]) for part in kept}) == 1
     if same and (np.diff(numbers) > 0).all():
-        return numbers, "no time stamps: the time of an image is the frame number in its file name"
-    return np.arange(float(len(names))), "no time stamps: the time of an image is its place among the files"
+        return numbers, "no timestamps: the time of an image is the frame number in its file name"
+    return np.arange(float(len(names))), "no timestamps: the time of an image is its place among the files"
 
 
 def check_poses(

@@ -26,7 +26,7 @@ def load(path: Path | str, *, width: int | None = None) -> tuple[Photographs, Ph
 
     As BARF has it, lengths are scaled so that the nearest depth of all is 4/3, the world is turned and moved
     into the mean camera (orthonormal here, BARF's only nearly) with axes right, down, forward, and depths
-    run from 1 to infinity in disparity. There are no stamps: see `notes`. DataError naming the file for
+    run from 1 to infinity in disparity. There are no timestamps: see `notes`. DataError naming the file for
     anything that cannot be used; ValueError for a width below 1.
     """
     file = Path(path) / "poses_bounds.npy"

@@ -1,4 +1,7 @@
-"""EuRoC recordings in the ASL layout: IMU, cameras and truth, with depth beside them or from a scan."""
+"""EuRoC recordings in the ASL layout.
+
+IMU, cameras and ground truth, with depth beside them or from a scan.
+"""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -36,7 +39,9 @@ from jaxpose.files.trajectories import Trajectory
 from jaxpose.geometry.camera import Camera
 from jaxpose.imu import Imu, ImuNoise
 
-_TRUTH_COLUMNS = "17 columns (stamp, 3 position, 4 quaternion, 3 velocity, 3 gyro bias, 3 accelerometer bias)"
+_TRUTH_COLUMNS = (
+    "17 columns (timestamp, 3 position, 4 quaternion, 3 velocity, 3 gyro bias, 3 accelerometer bias)"
+)
 
 
 class ImuLog(NamedTuple):
@@ -48,7 +53,7 @@ class ImuLog(NamedTuple):
     T_body_imu: Float[np.ndarray, "4 4"]
 
 
-class Truth(NamedTuple):
+class GroundTruth(NamedTuple):
     """Motion capture fused with the IMU; seconds on the clock of `load_imu`, SI units, body = IMU."""
 
     t: Float[np.ndarray, " n"]
@@ -59,7 +64,7 @@ class Truth(NamedTuple):
 
 
 class CameraLog(NamedTuple):
-    """One camera: images with stamps [ns since 1970], lens and intrinsics, and where it sits."""
+    """One camera: images with timestamps [ns since 1970], lens and intrinsics, and where it sits."""
 
     camera: Camera
     stamps_ns: list[int]
@@ -75,22 +80,24 @@ class _Depth(NamedTuple):
     notes: tuple[str, ...]
 
 
-def is_here(path: Path) -> bool:
+def detect(path: Path) -> bool:
     """Whether a folder has the layout's folders."""
     return any((path / name).is_dir() for name in ("mav0", "cam0", "imu0"))
 
 
 def load(path: Path | str) -> Recording:
-    """Read the sequence folder `path` (or its `mav0`) as frames of cam0 with depth, truth and IMU.
+    """Read the sequence folder `path` (or its `mav0`) as frames of cam0 with depth, ground truth and IMU.
 
-    Depth is that of `mav0/depth0`, in the layout of a camera (`data.csv` with stamp and file name, `data/`):
-    16-bit png in mm, registered to cam0 with its lens, and of the same stamps. Else it is that of the Vicon
-    room's scan, `mav0/pointcloud0/data.ply` or `data.ply` in the sequence folder, points in the frame of the
-    truth, projected into cam0 when a frame is read (`data.cloud`). Images are grey: three equal channels.
+    Depth is that of `mav0/depth0`, in the layout of a camera (`data.csv` with timestamp and file name,
+    `data/`): 16-bit png in mm, registered to cam0 with its lens, and of the same timestamps. Else it is that
+    of the Vicon room's scan, `mav0/pointcloud0/data.ply` or `data.ply` in the sequence folder, points in the
+    frame of the ground truth, projected into cam0 when a frame is read (`data.cloud`). Images are grey: three
+    equal channels.
 
-    The truth is interpolated to the images' stamps (cubic splines and slerp, within gaps of 0.1 s) and NaN
-    beyond. The body is the IMU, whose readings are as recorded, biases included, on the frames' clock. Frames
-    without depth are left out, as `notes` tells. DataError naming the file for anything that cannot be used.
+    The ground truth is interpolated to the images' timestamps (cubic splines and slerp, within gaps of 0.1 s)
+    and NaN beyond. The body is the IMU, whose readings are as recorded, biases included, on the frames'
+    clock. Frames without depth are left out, as `notes` tells. DataError naming the file for anything that
+    cannot be used.
     """
     mav0 = sensors(path)
     cam0, log = load_camera(mav0), load_imu(mav0)
@@ -103,7 +110,9 @@ def load(path: Path | str) -> Recording:
     if untrue:
         poses, lacking = None, untrue
     else:
-        poses, lacking = usable_poses(T_world_cam[rows], names, lambda i: names[i], "no truth near its stamp")
+        poses, lacking = usable_poses(
+            T_world_cam[rows], names, lambda i: names[i], "no ground truth near its timestamp"
+        )
     read_color(cam0.files[rows[0]])
     return Recording(
         name=(mav0.resolve().parent if mav0.resolve().name == "mav0" else mav0.resolve()).name,
@@ -122,7 +131,7 @@ def load(path: Path | str) -> Recording:
 def load_camera(path: Path | str, name: str = "cam0") -> CameraLog:
     """Read `mav0/<name>` of the sequence folder `path`: all images are there and of the stated size."""
     folder = sensors(path) / name
-    stamps, files = read_listing(folder)
+    timestamps, files = read_listing(folder)
     camera, T_body_cam = read_camera_sheet(folder / "sensor.yaml")
     size = common_size(files)
     if size != (camera.width, camera.height):
@@ -130,43 +139,45 @@ def load_camera(path: Path | str, name: str = "cam0") -> CameraLog:
             f"{folder / 'sensor.yaml'}: expected the images' resolution, {size[0]}x{size[1]}, "
             f"got {camera.width}x{camera.height}"
         )
-    return CameraLog(camera, stamps, files, T_body_cam)
+    return CameraLog(camera, timestamps, files, T_body_cam)
 
 
 def load_imu(path: Path | str) -> ImuLog:
     """Read `mav0/imu0` of the sequence folder `path`; DataError for files that cannot be used."""
     folder = sensors(path) / "imu0"
-    stamps, values, _ = read_csv(folder / "data.csv", IMU_COLUMNS)
+    timestamps, values, _ = read_csv(folder / "data.csv", IMU_COLUMNS)
     noise, T_body_imu = read_imu_sheet(folder / "sensor.yaml")
-    imu = Imu(seconds(stamps, stamps[0]), values[:, :3], values[:, 3:])
-    return ImuLog(imu, noise, stamps[0], T_body_imu)
+    imu = Imu(seconds(timestamps, timestamps[0]), values[:, :3], values[:, 3:])
+    return ImuLog(imu, noise, timestamps[0], T_body_imu)
 
 
-def load_truth(path: Path | str) -> Truth:
+def load_truth(path: Path | str) -> GroundTruth:
     """Read `mav0/state_groundtruth_estimate0` of the folder `path`; DataError as `load_imu`.
 
-    Its time starts at the first IMU stamp, hence the IMU's file has to be there too.
+    Its time starts at the first IMU timestamp, hence the IMU's file has to be there too.
     """
     file = sensors(path) / "state_groundtruth_estimate0" / "data.csv"
-    stamps, values, lines = read_csv(file, _TRUTH_COLUMNS)
+    timestamps, values, lines = read_csv(file, _TRUTH_COLUMNS)
     t0_ns = read_csv(sensors(path) / "imu0" / "data.csv", IMU_COLUMNS, rows=1)[0][0]
     norm = np.linalg.norm(values[:, 3:7], axis=1)
     if abs(norm - 1).max() > 1e-2:
         row = int(abs(norm - 1).argmax())
         raise DataError(f"{file}:{lines[row]}: expected a unit quaternion, got norm {norm[row]:.4g}")
-    T_world_body = np.tile(np.eye(4), (len(stamps), 1, 1))
+    T_world_body = np.tile(np.eye(4), (len(timestamps), 1, 1))
     T_world_body[:, :3, :3] = Rotation.from_quat(values[:, [4, 5, 6, 3]]).as_matrix()
     T_world_body[:, :3, 3] = values[:, :3]
-    return Truth(seconds(stamps, t0_ns), T_world_body, values[:, 7:10], values[:, 10:13], values[:, 13:16])
+    return GroundTruth(
+        seconds(timestamps, t0_ns), T_world_body, values[:, 7:10], values[:, 10:13], values[:, 13:16]
+    )
 
 
 def _truth_at(mav0: Path, t: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarray, "n 4 4"], tuple[str, ...]]:
-    """T_world_body at times on the IMU's clock, NaN where the truth has a gap; a note if there is none."""
+    """T_world_body at times on the IMU's clock, NaN where ground truth has a gap; a note if there is none."""
     if not (mav0 / "state_groundtruth_estimate0").is_dir():
         none = np.full((len(t), 4, 4), np.nan)
-        return none, ("no state_groundtruth_estimate0: there is no truth to compare with",)
-    truth = load_truth(mav0)
-    return poses_at(Trajectory(truth.t, truth.T_world_body), t), ()
+        return none, ("no state_groundtruth_estimate0: there is no ground truth to compare with",)
+    ground_truth = load_truth(mav0)
+    return poses_at(Trajectory(ground_truth.t, ground_truth.T_world_body), t), ()
 
 
 def _find_depth(mav0: Path, cam0: CameraLog, T_world_cam: Float[np.ndarray, "n 4 4"]) -> _Depth:
@@ -184,17 +195,19 @@ def _find_depth(mav0: Path, cam0: CameraLog, T_world_cam: Float[np.ndarray, "n 4
 
 
 def _given_depth(folder: Path, cam0: CameraLog) -> _Depth:
-    stamps, files = read_listing(folder)
-    by_stamp = dict(zip(stamps, files, strict=True))
-    rows = [row for row, stamp in enumerate(cam0.stamps_ns) if stamp in by_stamp]
+    timestamps, files = read_listing(folder)
+    by_stamp = dict(zip(timestamps, files, strict=True))
+    rows = [row for row, timestamp in enumerate(cam0.stamps_ns) if timestamp in by_stamp]
     if not rows:
         raise DataError(
-            f"{folder / 'data.csv'}: expected stamps of cam0, got {stamps[0]} and others without one"
+            f"{folder / 'data.csv'}: expected timestamps of cam0, got {timestamps[0]} and others without one"
         )
     chosen = {row: by_stamp[cam0.stamps_ns[row]] for row in rows}
     common_size([cam0.files[rows[0]], *chosen.values()])
     check_depth(folder, list(chosen.values()))
-    return _Depth(rows, lambda row: read_depth(chosen[row]), _left_out(cam0, rows, "no depth of their stamp"))
+    return _Depth(
+        rows, lambda row: read_depth(chosen[row]), _left_out(cam0, rows, "no depth of their timestamp")
+    )
 
 
 def _cloud_depth(file: Path, cam0: CameraLog, T_world_cam: Float[np.ndarray, "n 4 4"]) -> _Depth:
@@ -202,11 +215,15 @@ def _cloud_depth(file: Path, cam0: CameraLog, T_world_cam: Float[np.ndarray, "n 
     usable = np.isfinite(points).all(axis=1)
     rows = [int(row) for row in np.flatnonzero(np.isfinite(T_world_cam).all((1, 2)))]
     if not rows:
-        raise DataError(f"{file}: expected true poses to project the cloud with, got none at cam0's stamps")
+        raise DataError(
+            f"{file}: expected true poses to project the cloud with, got none at cam0's timestamps"
+        )
     look = depth_from_cloud(cam0.camera, points[usable])
     if not any(look(T_world_cam[row]).any() for row in rows[:: max(1, len(rows) // 5)]):
         raise DataError(f"{file}: expected points in the view of cam0, got none")
-    source = f"depth from the {usable.sum()} points of {file.name}, taken to be in the frame of the truth"
+    source = (
+        f"depth from the {usable.sum()} points of {file.name}, taken to be in the frame of the ground truth"
+    )
     ignored = (f"{(~usable).sum()} points with NaN or infinity ignored",) if not usable.all() else ()
     notes = (source, *ignored, *_left_out(cam0, rows, "no true pose to see the cloud from"))
     return _Depth(rows, lambda row: look(T_world_cam[row]), notes)
@@ -214,7 +231,7 @@ def _cloud_depth(file: Path, cam0: CameraLog, T_world_cam: Float[np.ndarray, "n 
 
 def _left_out(cam0: CameraLog, rows: list[int], reason: str) -> tuple[str, ...]:
     kept = set(rows)
-    out = [str(stamp) for row, stamp in enumerate(cam0.stamps_ns) if row not in kept]
+    out = [str(timestamp) for row, timestamp in enumerate(cam0.stamps_ns) if row not in kept]
     return (f"{len(out)} of {len(cam0.files)} frames left out, {reason}: {some(out)}",) if out else ()
 
 

@@ -11,7 +11,7 @@ from jaxpose.errors import DataError
 from jaxpose.geometry.camera import Camera
 from jaxpose.imu import ImuNoise
 
-IMU_COLUMNS = "7 columns (stamp, 3 rates, 3 accelerations)"
+IMU_COLUMNS = "7 columns (timestamp, 3 rates, 3 accelerations)"
 
 
 def sensors(path: Path | str) -> Path:
@@ -22,9 +22,9 @@ def sensors(path: Path | str) -> Path:
     return path / "mav0" if (path / "mav0").is_dir() else path
 
 
-def seconds(stamps: list[int], t0_ns: int) -> Float[np.ndarray, " n"]:
+def seconds(timestamps: list[int], t0_ns: int) -> Float[np.ndarray, " n"]:
     """Nanoseconds since 1970 need 61 bits, a float has 53: subtract as integers, then convert."""
-    return np.array([stamp - t0_ns for stamp in stamps]) * 1e-9
+    return np.array([timestamp - t0_ns for timestamp in timestamps]) * 1e-9
 
 
 def _read_text(file: Path) -> str:
@@ -36,9 +36,9 @@ def _read_text(file: Path) -> str:
 def read_csv(
     file: Path, columns: str, rows: int | None = None
 ) -> tuple[list[int], Float[np.ndarray, "n c"], list[int]]:
-    """Stamps [ns], other columns and line numbers of the first `rows` rows; errors name `columns`."""
+    """Timestamps [ns], other columns and line numbers of the first `rows` rows; errors name `columns`."""
     count = int(columns.split()[0])
-    stamps, values, lines = [], [], []
+    timestamps, values, lines = [], [], []
     for number, line in enumerate(_read_text(file).splitlines(), start=1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
@@ -46,42 +46,42 @@ def read_csv(
         if len(fields) != count:
             raise DataError(f"{file}:{number}: expected {columns}, got {len(fields)}")
         try:
-            stamp, row = int(fields[0]), [float(field) for field in fields[1:]]
+            timestamp, row = int(fields[0]), [float(field) for field in fields[1:]]
         except ValueError:
             raise DataError(
-                f"{file}:{number}: expected a stamp in ns and numbers, got {line[:60]!r}"
+                f"{file}:{number}: expected a timestamp in ns and numbers, got {line[:60]!r}"
             ) from None
         if not all(map(math.isfinite, row)):
             raise DataError(f"{file}:{number}: expected finite numbers, got {line[:60]!r}")
-        if stamps and stamp <= stamps[-1]:
-            raise DataError(f"{file}:{number}: expected a stamp after {stamps[-1]}, got {stamp}")
-        stamps.append(stamp)
+        if timestamps and timestamp <= timestamps[-1]:
+            raise DataError(f"{file}:{number}: expected a timestamp after {timestamps[-1]}, got {timestamp}")
+        timestamps.append(timestamp)
         values.append(row)
         lines.append(number)
-        if len(stamps) == rows:
+        if len(timestamps) == rows:
             break
-    if not stamps:
+    if not timestamps:
         raise DataError(f"{file}: expected lines of {columns}, got none")
-    return stamps, np.array(values), lines
+    return timestamps, np.array(values), lines
 
 
 def read_listing(folder: Path) -> tuple[list[int], list[Path]]:
-    """Stamps [ns] and image files of `data.csv`, lines of stamp and file name."""
+    """Timestamps [ns] and image files of `data.csv`, lines of timestamp and file name."""
     file = folder / "data.csv"
-    stamps, files = [], []
+    timestamps, files = [], []
     for number, line in enumerate(_read_text(file).splitlines(), start=1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
-        stamp, _, name = (field.strip() for field in line.partition(","))
-        if not (stamp.isdecimal() and name):
-            raise DataError(f"{file}:{number}: expected a stamp in ns and a file name, got {line[:60]!r}")
-        if stamps and int(stamp) <= stamps[-1]:
-            raise DataError(f"{file}:{number}: expected a stamp after {stamps[-1]}, got {stamp}")
-        stamps.append(int(stamp))
+        timestamp, _, name = (field.strip() for field in line.partition(","))
+        if not (timestamp.isdecimal() and name):
+            raise DataError(f"{file}:{number}: expected a timestamp in ns and a file name, got {line[:60]!r}")
+        if timestamps and int(timestamp) <= timestamps[-1]:
+            raise DataError(f"{file}:{number}: expected a timestamp after {timestamps[-1]}, got {timestamp}")
+        timestamps.append(int(timestamp))
         files.append(folder / "data" / name)
-    if not stamps:
-        raise DataError(f"{file}: expected lines of a stamp and a file name, got none")
-    return stamps, files
+    if not timestamps:
+        raise DataError(f"{file}: expected lines of a timestamp and a file name, got none")
+    return timestamps, files
 
 
 def read_imu_sheet(file: Path) -> tuple[ImuNoise, Float[np.ndarray, "4 4"]]:

@@ -17,23 +17,25 @@ _TEXT_COLUMNS = "7 numbers (t wx wy wz ax ay az)"
 
 
 def read_imu(file: Path | str) -> Imu:
-    """Read raw readings [rad/s, m/s^2, gravity in them] with stamps [s] on the file's own clock.
+    """Read raw readings [rad/s, m/s^2, gravity in them] with timestamps [s] on the file's own clock.
 
-    With commas a line is that of EuRoC's `imu0/data.csv`, its stamp in whole ns; with blanks it is
+    With commas a line is that of EuRoC's `imu0/data.csv`, its timestamp in whole ns; with blanks it is
     `t wx wy wz ax ay az`, t in seconds. DataError naming file and line for anything else, for text or NaN,
-    for stamps that repeat or go backwards, and for fewer than two readings; FileNotFoundError as usual.
+    for timestamps that repeat or go backwards, and for fewer than two readings; FileNotFoundError as usual.
     """
     file = Path(file)
     text = file.read_text(encoding="utf-8-sig", errors="replace").splitlines()
     first = next((line for line in text if line.strip() and not line.lstrip().startswith("#")), "")
     if "," in first:
-        stamps, values, _ = read_csv(file, IMU_COLUMNS)
-        t = seconds(stamps, 0)
+        timestamps, values, _ = read_csv(file, IMU_COLUMNS)
+        t = seconds(timestamps, 0)
     else:
         lines, table = read_numbers(file, _TEXT_COLUMNS, (7,))
         t, values = table[:, 0], table[:, 1:]
         for row in np.flatnonzero(np.diff(t) <= 0) + 1:
-            raise DataError(f"{file}:{lines[row]}: expected a stamp after {t[row - 1]!s} s, got {t[row]!s} s")
+            raise DataError(
+                f"{file}:{lines[row]}: expected a timestamp after {t[row - 1]!s} s, got {t[row]!s} s"
+            )
     if len(t) < 2:
         raise DataError(f"{file}: expected at least 2 readings, got {len(t)}")
     return Imu(t, values[:, :3], values[:, 3:])
@@ -66,7 +68,8 @@ def read_mounting(file: Path | str) -> Float[np.ndarray, "4 4"]:
 def with_imu(recording: Recording, readings: Path | str, mounting: Path | str) -> Recording:
     """The recording with the IMU of `readings` in place of any it has, at `mounting` from the camera.
 
-    Stamps count on the clock of the recording's own files; of one without stamps, from its first frame.
+    Timestamps count on the clock of the recording's own files; of one without timestamps, from its first
+    frame.
     """
     imu = read_imu(readings)
     return recording._replace(

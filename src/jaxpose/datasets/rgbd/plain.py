@@ -13,7 +13,6 @@ from jaxpose.datasets.images import (
     INTRINSICS,
     SUFFIXES,
     Pinhole,
-    beside,
     check_depth,
     check_intrinsics,
     check_positive,
@@ -25,6 +24,7 @@ from jaxpose.datasets.images import (
     read_color,
     read_depth,
     read_intrinsics,
+    sidecar,
     some,
     usable_poses,
     within,
@@ -36,7 +36,7 @@ from jaxpose.files.trajectories import nearest, read_kitti, read_tum
 from jaxpose.geometry.camera import Camera
 
 _JSON = "intrinsics.json"
-_MOST_APART_S = 0.02  # between a frame's stamp and that of its pose
+_MOST_APART_S = 0.02  # between a frame's timestamp and that of its pose
 _POSE_COLUMNS = "16 (4x4), 12 (KITTI) or 8 (TUM) numbers"
 
 
@@ -45,7 +45,7 @@ class _Stated(NamedTuple):
     depth_per_metre: float | None
 
 
-def is_here(path: Path) -> bool:
+def detect(path: Path) -> bool:
     """Whether a folder has one of the layout's two folders."""
     return (path / "color").is_dir() or (path / "depth").is_dir()
 
@@ -58,10 +58,10 @@ def load(path: Path | str, *, rate_hz: float = 30.0, depth_per_metre: float | No
     width height depth_scale), in the folder or one up. Depth is registered to colour, 16 bits; counts per
     metre are `depth_per_metre`, else the file's depth_scale, else 1000.
 
-    `times.txt` has a stamp [s] for each colour image; without it their period is 1 / rate_hz. `poses.txt` has
-    a camera-to-world pose for each colour image, of 16 numbers (4x4, NaN where there is none) or KITTI's 12,
-    or TUM's lines of 8: these go by their stamps, within 0.02 s, if there is a `times.txt`, and state the
-    times of as many images if there is none. What was left out or assumed is told in `notes`.
+    `times.txt` has a timestamp [s] for each colour image; without it their period is 1 / rate_hz. `poses.txt`
+    has a camera-to-world pose for each colour image, of 16 numbers (4x4, NaN where there is none) or KITTI's
+    12, or TUM's lines of 8: these go by their timestamps, within 0.02 s, if there is a `times.txt`, and state
+    the times of as many images if there is none. What was left out or assumed is told in `notes`.
 
     DataError naming the file for anything that cannot be used; ValueError for a setting that is not positive.
     """
@@ -77,13 +77,16 @@ def load(path: Path | str, *, rate_hz: float = 30.0, depth_per_metre: float | No
     assumed = () if depth_per_metre or stated_per_metre else ("no depth_scale: took depth as mm",)
     check_depth(folder, depths, per_metre)
     read_color(colors[0])
-    t, truth = _times_and_poses(folder, len(all_colors), rate_hz)
-    if truth is None:
-        poses, lacking = None, ("no poses.txt: there is no truth to compare with",)
+    t, ground_truth = _times_and_poses(folder, len(all_colors), rate_hz)
+    if ground_truth is None:
+        poses, lacking = None, ("no poses.txt: there is no ground truth to compare with",)
     else:
         names = [color.stem for color in colors]
         poses, lacking = usable_poses(
-            truth[rows], names, lambda i: f"{folder / 'poses.txt'}: pose {rows[i]}", "none, NaN or infinity"
+            ground_truth[rows],
+            names,
+            lambda i: f"{folder / 'poses.txt'}: pose {rows[i]}",
+            "none, NaN or infinity",
         )
     return Recording(
         name=name_of(folder),
@@ -128,9 +131,9 @@ def _pairs(
 
 def _intrinsics(folder: Path, size: tuple[int, int]) -> _Stated:
     """Intrinsics, and the depth scale if the file has one."""
-    if (file := beside(folder, INTRINSICS)) is not None:
+    if (file := sidecar(folder, INTRINSICS)) is not None:
         return _Stated(read_intrinsics(file, size), None)
-    if (file := beside(folder, _JSON)) is None:
+    if (file := sidecar(folder, _JSON)) is None:
         raise DataError(f"{folder}: expected {INTRINSICS} or {_JSON} in it or one folder up, got neither")
     try:
         values = json.loads(file.read_text("utf-8-sig"))
@@ -159,7 +162,7 @@ def _times_and_poses(
     file = folder / "poses.txt"
     columns = _columns(file) if file.is_file() else 0
     if columns == 8:
-        trajectory = read_tum(file, first_of_equal=t is not None)
+        trajectory = read_tum(file, first_of_repeated=t is not None)
         if t is None:
             _check_count(file, len(trajectory.t), count)
             return trajectory.t, trajectory.T
@@ -179,14 +182,14 @@ def _times_and_poses(
 
 
 def _read_times(file: Path, count: int) -> Float[np.ndarray, " n"] | None:
-    """Increasing stamps, one for each colour image; None without a file."""
+    """Increasing timestamps, one for each colour image; None without a file."""
     if not file.is_file():
         return None
-    lines, values = read_numbers(file, "1 number (a stamp in seconds)", (1,))
+    lines, values = read_numbers(file, "1 number (a timestamp in seconds)", (1,))
     _check_count(file, len(values), count)
     t = values[:, 0]
     for row in np.flatnonzero(np.diff(t) <= 0) + 1:
-        raise DataError(f"{file}:{lines[row]}: expected a stamp after {t[row - 1]:g} s, got {t[row]:g} s")
+        raise DataError(f"{file}:{lines[row]}: expected a timestamp after {t[row - 1]:g} s, got {t[row]:g} s")
     return t
 
 

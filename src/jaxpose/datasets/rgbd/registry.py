@@ -16,7 +16,7 @@ class _Layout(NamedTuple):
     """What a layout looks like in words, whether a folder has it, and its loader."""
 
     files: str
-    is_here: Callable[[Path], bool]
+    detect: Callable[[Path], bool]
     load: Callable[[Path | str, float], Recording]
 
 
@@ -24,20 +24,20 @@ class _Layout(NamedTuple):
 _LAYOUTS: dict[Format, _Layout] = {
     "sevenscenes": _Layout(
         "frame-NNNNNN.color.png and frame-NNNNNN.depth.png",
-        sevenscenes.is_here,
+        sevenscenes.detect,
         lambda path, rate_hz: sevenscenes.load(path, rate_hz=rate_hz),
     ),
-    "tum": _Layout("rgb.txt and depth.txt", tum.is_here, lambda path, rate_hz: tum.load(path)),
+    "tum": _Layout("rgb.txt and depth.txt", tum.detect, lambda path, rate_hz: tum.load(path)),
     "replica": _Layout(
-        "results/ and traj.txt", replica.is_here, lambda path, rate_hz: replica.load(path, rate_hz=rate_hz)
+        "results/ and traj.txt", replica.detect, lambda path, rate_hz: replica.load(path, rate_hz=rate_hz)
     ),
     "scannet": _Layout(
-        "color/, depth/ and pose/", scannet.is_here, lambda path, rate_hz: scannet.load(path, rate_hz=rate_hz)
+        "color/, depth/ and pose/", scannet.detect, lambda path, rate_hz: scannet.load(path, rate_hz=rate_hz)
     ),
-    "euroc": _Layout("mav0/cam0 and mav0/imu0", euroc.is_here, lambda path, rate_hz: euroc.load(path)),
+    "euroc": _Layout("mav0/cam0 and mav0/imu0", euroc.detect, lambda path, rate_hz: euroc.load(path)),
     "plain": _Layout(
         "color/, depth/ and intrinsics",
-        plain.is_here,
+        plain.detect,
         lambda path, rate_hz: plain.load(path, rate_hz=rate_hz),
     ),
 }
@@ -48,7 +48,7 @@ def find_format(path: Path | str) -> Format:
     path = Path(path)
     if path.is_dir():
         for name in get_args(Format):
-            if _LAYOUTS[name].is_here(path):
+            if _LAYOUTS[name].detect(path):
                 return name
     expected = ", or ".join(f"{layout.files} ({name})" for name, layout in _LAYOUTS.items())
     raise DataError(f"{path}: expected a folder of {expected}, got {found(path)}")
@@ -57,6 +57,6 @@ def find_format(path: Path | str) -> Format:
 def load(path: Path | str, format: Format | None = None, *, rate_hz: float = 30.0) -> Recording:
     """Read a recording in the layout `format`, or in the one that `find_format` finds.
 
-    `rate_hz` is the frame rate where a layout has no time stamps. Errors as those of the loader.
+    `rate_hz` is the frame rate where a layout has no timestamps. Errors as those of the loader.
     """
     return _LAYOUTS[format or find_format(path)].load(path, rate_hz)

@@ -11,16 +11,16 @@ from jaxtyping import Float
 
 from jaxpose.datasets.images import (
     Pinhole,
-    beside,
     check_depth,
     check_intrinsics,
     common_size,
+    default_intrinsics,
     found,
     frame_times,
     name_of,
-    published,
     read_color,
     read_depth,
+    sidecar,
     some,
     usable_poses,
     within,
@@ -43,7 +43,7 @@ class _Parameters(NamedTuple):
     notes: tuple[str, ...]
 
 
-def is_here(path: Path) -> bool:
+def detect(path: Path) -> bool:
     """Whether a folder has the layout's images or poses."""
     return (path / "results").is_dir() or (path / "traj.txt").is_file()
 
@@ -52,7 +52,7 @@ def load(path: Path | str, *, rate_hz: float = 30.0) -> Recording:
     """Read the scene folder `path`.
 
     Line k of `traj.txt` is the camera-to-world pose of frame k, 16 numbers row by row, axes right, down,
-    forward already (NICE-SLAM turns them to OpenGL's when it reads them). There are no stamps: frame k is
+    forward already (NICE-SLAM turns them to OpenGL's when it reads them). There are no timestamps: frame k is
     (k - first) / rate_hz seconds after the first. Intrinsics and depth counts per metre are those of
     `cam_params.json` in the folder or one up, else the published ones, as `notes` says. Depth [m] is 0 where
     there is none or it is 10 m and more (0 or 65535 counts).
@@ -99,9 +99,9 @@ def _list_frames(folder: Path) -> tuple[list[int], list[Path], list[Path], tuple
 
 def _read_parameters(folder: Path, size: tuple[int, int]) -> _Parameters:
     """Intrinsics and depth scale, and a note where they are assumed."""
-    file = beside(folder, _PARAMETERS)
+    file = sidecar(folder, _PARAMETERS)
     if file is None:
-        note = published(_PUBLISHED, size, _PUBLISHED_SIZE, _PARAMETERS)
+        note = default_intrinsics(_PUBLISHED, size, _PUBLISHED_SIZE, _PARAMETERS)
         return _Parameters(_PUBLISHED, _PER_METRE, (f"{note}, and {_PER_METRE} depth counts per metre",))
     try:
         values = json.loads(file.read_text("utf-8-sig"))["camera"]
@@ -123,9 +123,9 @@ def _read_parameters(folder: Path, size: tuple[int, int]) -> _Parameters:
 
 
 def _read_poses(file: Path, numbers: list[int]) -> tuple[Float[np.ndarray, "n 4 4"] | None, tuple[str, ...]]:
-    """Truth by frame number, and notes on what is missing or was repaired."""
+    """Ground truth by frame number, and notes on what is missing or was repaired."""
     if not file.is_file():
-        return None, ("no traj.txt: there is no truth to compare with",)
+        return None, ("no traj.txt: there is no ground truth to compare with",)
     lines, rows = read_numbers(file, "16 numbers (a 4x4 pose, row by row)", (16,), finite=False)
     poses = np.full((len(numbers), 4, 4), np.nan)
     for i, number in enumerate(numbers):

@@ -10,10 +10,10 @@ from jaxpose.datasets.images import (
     Pinhole,
     check_depth,
     common_size,
+    default_intrinsics,
     found,
     frame_times,
     name_of,
-    published,
     read_color,
     read_depth,
     read_intrinsics,
@@ -32,7 +32,7 @@ _PUBLISHED = Pinhole(577.590698, 578.729797, 318.905426, 242.683609)  # NICE-SLA
 _PUBLISHED_SIZE = (640, 480)
 
 
-def is_here(path: Path) -> bool:
+def detect(path: Path) -> bool:
     """Whether a folder has the layout's folders; a plain one has no `pose/`, `intrinsic/` or `frames/`."""
     exported = any((path / name).is_dir() for name in ("pose", "intrinsic"))
     return (path / "frames" / "color").is_dir() or (exported and (path / "color").is_dir())
@@ -43,8 +43,8 @@ def load(path: Path | str, *, rate_hz: float = 30.0) -> Recording:
 
     Colour is resized to the size of depth, whose intrinsics are those of `intrinsic/intrinsic_depth.txt`
     (4x4), else the ones that NICE-SLAM takes for every scene. Depth is in mm. Poses are camera-to-world; one
-    that is missing or holds infinity, as the data set's own lost frames do, is a truth of NaN. Frame N is
-    (N - first) / rate_hz seconds after the first. `notes` tells what was left out, resized or assumed.
+    that is missing or holds infinity, as the data set's own lost frames do, is a ground truth of NaN. Frame N
+    is (N - first) / rate_hz seconds after the first. `notes` tells what was left out, resized or assumed.
 
     DataError naming the file for anything that cannot be used; ValueError for a rate that is not positive.
     """
@@ -95,13 +95,13 @@ def _intrinsics(folders: tuple[Path, ...], size: tuple[int, int]) -> tuple[Pinho
     for folder in folders:
         if (folder / _INTRINSICS).is_file():
             return read_intrinsics(folder / _INTRINSICS, size, rows=4), ()
-    return _PUBLISHED, (published(_PUBLISHED, size, _PUBLISHED_SIZE, _INTRINSICS),)
+    return _PUBLISHED, (default_intrinsics(_PUBLISHED, size, _PUBLISHED_SIZE, _INTRINSICS),)
 
 
 def _read_poses(
     folder: Path, numbers: list[int]
 ) -> tuple[Float[np.ndarray, "n 4 4"] | None, tuple[str, ...]]:
-    """Truth, and notes on what is missing or was repaired."""
+    """Ground truth, and notes on what is missing or was repaired."""
     files = [folder / f"{number}.txt" for number in numbers]
     poses = [read_matrix(file, 4) if file.is_file() else np.full((4, 4), np.nan) for file in files]
     names = [str(number) for number in numbers]

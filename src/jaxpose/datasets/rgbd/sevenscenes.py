@@ -10,18 +10,18 @@ from jaxtyping import Float
 from jaxpose.datasets.images import (
     INTRINSICS,
     Pinhole,
-    beside,
     check_depth,
     common_size,
+    default_intrinsics,
     found,
     frame_times,
     name_of,
     only,
-    published,
     read_color,
     read_depth,
     read_intrinsics,
     read_matrix,
+    sidecar,
     some,
     usable_poses,
     within,
@@ -44,7 +44,7 @@ class _Files(NamedTuple):
     pose: Path | None
 
 
-def is_here(path: Path) -> bool:
+def detect(path: Path) -> bool:
     """Whether a folder is a sequence or holds sequences."""
     return any(_FRAME.fullmatch(file.name) or file.match("seq-*") for file in path.iterdir())
 
@@ -52,10 +52,10 @@ def is_here(path: Path) -> bool:
 def load(path: Path | str, *, rate_hz: float = 30.0) -> Recording:
     """Read the sequence folder `path`, or the only `seq-*` in it.
 
-    The data set has no time stamps: frame number k is (k - first) / rate_hz seconds after the first, so a
+    The data set has no timestamps: frame number k is (k - first) / rate_hz seconds after the first, so a
     missing frame leaves its gap. Depth [m] is 0 where the sensor gave none (0 or 65535 mm). Poses are
-    optional: one with NaN or infinity, or missing while others are there, is a truth of NaN. What had to be
-    skipped, repaired or assumed is told in `notes`. Images are read when asked for.
+    optional: one with NaN or infinity, or missing while others are there, is a ground truth of NaN. What had
+    to be skipped, repaired or assumed is told in `notes`. Images are read when asked for.
 
     DataError naming the file for anything that cannot be used; ValueError for a rate that is not positive.
     """
@@ -109,14 +109,14 @@ def _list_frames(folder: Path) -> tuple[list[_Files], tuple[str, ...]]:
 
 def _intrinsics(folder: Path, size: tuple[int, int]) -> tuple[Pinhole, tuple[str, ...]]:
     """Those of the file in or beside the sequence, else as published, with a note."""
-    file = beside(folder, INTRINSICS)
+    file = sidecar(folder, INTRINSICS)
     if file is None:
-        return _PUBLISHED, (published(_PUBLISHED, size, _PUBLISHED_SIZE, INTRINSICS),)
+        return _PUBLISHED, (default_intrinsics(_PUBLISHED, size, _PUBLISHED_SIZE, INTRINSICS),)
     return read_intrinsics(file, size), ()
 
 
 def _read_poses(frames: list[_Files]) -> tuple[Float[np.ndarray, "n 4 4"] | None, tuple[str, ...]]:
-    """Truth, and notes on what is missing or was repaired."""
+    """Ground truth, and notes on what is missing or was repaired."""
     none = np.full((4, 4), np.nan)
     poses = [none if frame.pose is None else read_matrix(frame.pose, 4) for frame in frames]
     names = [f"{frame.number:06d}" for frame in frames]

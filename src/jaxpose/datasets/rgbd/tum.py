@@ -10,16 +10,16 @@ from jaxtyping import Float, Int
 from jaxpose.datasets.images import (
     INTRINSICS,
     Pinhole,
-    beside,
     check_depth,
     check_positive,
     common_size,
+    default_intrinsics,
     found,
     name_of,
-    published,
     read_color,
     read_depth,
     read_intrinsics,
+    sidecar,
     some,
     usable_poses,
     within,
@@ -51,7 +51,7 @@ class Stamped(NamedTuple):
     files: list[Path]
 
 
-def is_here(path: Path) -> bool:
+def detect(path: Path) -> bool:
     """Whether a folder has one of the layout's lists."""
     return (path / "rgb.txt").is_file() or (path / "depth.txt").is_file()
 
@@ -59,15 +59,15 @@ def is_here(path: Path) -> bool:
 def load(path: Path | str, *, max_difference_s: float = 0.02, depth_per_metre: float = 5000.0) -> Recording:
     """Read the sequence folder `path`.
 
-    Colour and depth are paired one to one, nearest first, if their stamps are less than `max_difference_s`
-    apart (0.02 s is the data set's own tools'); frames have the stamps of colour. The true pose is the one
-    nearest in time, NaN where none is that close; without `groundtruth.txt` there is no truth, and of lines
-    with one stamp (the published fr2_desk has two) the first counts. Intrinsics (3x3) are read from
-    `camera-intrinsics.txt` in or beside the folder; else they and the lens are the published ones of
-    freiburg1, 2 or 3, by the folder's name. Depth is registered to colour and stored as `depth_per_metre`
-    counts. `accelerometer.txt` (m/s^2) is the Kinect's own, whose axes are left, up and forward (Microsoft's
-    Kinect documentation, "Accelerometer"): without truth it says which way is up. `notes` tells what was left
-    out or assumed, and whether the accelerometer disagrees with the truth.
+    Colour and depth are paired one to one, nearest first, if their timestamps are less than
+    `max_difference_s` apart (0.02 s is the data set's own tools'); frames have the timestamps of colour. The
+    true pose is the one nearest in time, NaN where none is that close; without `groundtruth.txt` there is no
+    ground truth, and of lines with one timestamp (the published fr2_desk has two) the first counts.
+    Intrinsics (3x3) are read from `camera-intrinsics.txt` in or beside the folder; else they and the lens are
+    the published ones of freiburg1, 2 or 3, by the folder's name. Depth is registered to colour and stored as
+    `depth_per_metre` counts. `accelerometer.txt` (m/s^2) is the Kinect's own, whose axes are left, up and
+    forward (Microsoft's Kinect documentation, "Accelerometer"): without ground truth it says which way is up.
+    `notes` tells what was left out or assumed, and whether the accelerometer disagrees with the ground truth.
 
     DataError naming the file for anything that cannot be used; ValueError for a setting that is not positive.
     """
@@ -78,59 +78,61 @@ def load(path: Path | str, *, max_difference_s: float = 0.02, depth_per_metre: f
         raise DataError(f"{folder}: expected a folder with rgb.txt and depth.txt, got {found(folder)}")
     color, depth = read_list(folder / "rgb.txt"), read_list(folder / "depth.txt")
     rows, partners = _pairs(folder, color.t, depth.t, max_difference_s)
-    stamps = color.t[rows]
+    timestamps = color.t[rows]
     colors, depths = [color.files[i] for i in rows], [depth.files[i] for i in partners]
     size = common_size([*colors, *depths])
     pinhole, lens, assumed = _camera(folder, size)
     check_depth(folder, depths, depth_per_metre)
     read_color(colors[0])
-    poses, lacking = _truth(folder / "groundtruth.txt", stamps, max_difference_s)
+    poses, lacking = _truth(folder / "groundtruth.txt", timestamps, max_difference_s)
     notes = [*_alone("colour", "depth", color, rows, max_difference_s)]
     notes += [*_alone("depth", "colour", depth, partners, max_difference_s), *assumed, *lacking]
-    accelerometer, weighed = _accelerometer(folder / "accelerometer.txt", stamps, poses)
+    accelerometer, weighed = _accelerometer(folder / "accelerometer.txt", timestamps, poses)
     return Recording(
         name=name_of(folder),
         camera=Camera(*pinhole, *size, lens),
-        t=stamps - stamps[0],
+        t=timestamps - timestamps[0],
         read=lambda i: Frame(read_color(colors[i]), read_depth(depths[i], depth_per_metre)),
         T_world_cam=poses,
         accelerometer=accelerometer,
         notes=(*notes, *weighed),
-        t0=float(stamps[0]),
+        t0=float(timestamps[0]),
         files=within(colors, path),
     )
 
 
 def read_list(file: Path) -> Stamped:
-    """Lines of `stamp name`, names relative to the list, stamps increasing."""
+    """Lines of `timestamp name`, names relative to the list, timestamps increasing."""
     if not file.is_file():
-        raise DataError(f"{file}: expected lines of a stamp and a file name, got {found(file)}")
-    stamps, files = [], []
+        raise DataError(f"{file}: expected lines of a timestamp and a file name, got {found(file)}")
+    timestamps, files = [], []
     for number, line in enumerate(file.read_text("utf-8-sig", "replace").splitlines(), start=1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
         fields = line.split(maxsplit=1)
         try:
-            stamp, name = float(fields[0]), fields[1].strip()
+            timestamp, name = float(fields[0]), fields[1].strip()
         except (ValueError, IndexError):
-            stamp, name = np.nan, ""
-        if not np.isfinite(stamp):
+            timestamp, name = np.nan, ""
+        if not np.isfinite(timestamp):
             raise DataError(
-                f"{file}:{number}: expected a stamp in seconds and a file name, got {line[:60]!r}"
+                f"{file}:{number}: expected a timestamp in seconds and a file name, got {line[:60]!r}"
             )
-        if stamps and stamp <= stamps[-1]:
-            raise DataError(f"{file}:{number}: expected a stamp after {stamps[-1]!r} s, got {stamp!r} s")
-        stamps.append(stamp)
+        if timestamps and timestamp <= timestamps[-1]:
+            raise DataError(
+                f"{file}:{number}: expected a timestamp after {timestamps[-1]!r} s, got {timestamp!r} s"
+            )
+        timestamps.append(timestamp)
         files.append(file.parent / name)
-    if not stamps:
-        raise DataError(f"{file}: expected lines of a stamp and a file name, got none")
-    return Stamped(np.array(stamps), files)
+    if not timestamps:
+        raise DataError(f"{file}: expected lines of a timestamp and a file name, got none")
+    return Stamped(np.array(timestamps), files)
 
 
 def _pairs(
     folder: Path, t: Float[np.ndarray, " n"], other: Float[np.ndarray, " m"], limit: float
 ) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
-    """Indices of stamps less than `limit` apart, each used once, the closest pairs first."""
+    """Indices of timestamps less than `limit` apart, each used once, the closest pairs first."""
     first, last = np.searchsorted(other, t - limit), np.searchsorted(other, t + limit)
     near = sorted((abs(t[i] - other[j]), i, j) for i in range(len(t)) for j in range(first[i], last[i]))
     partner: dict[int, int] = {}
@@ -142,7 +144,8 @@ def _pairs(
     if not partner:
         spans = [f"{x[0]:.3f} to {x[-1]:.3f} s" for x in (t, other)]
         raise DataError(
-            f"{folder}: expected colour and depth within {limit:g} s, got stamps from {' and '.join(spans)}"
+            f"{folder}: expected colour and depth within {limit:g} s, "
+            f"got timestamps from {' and '.join(spans)}"
         )
     rows = sorted(partner)
     return np.array(rows), np.array([partner[i] for i in rows])
@@ -163,7 +166,7 @@ def _alone(
 
 def _camera(folder: Path, size: tuple[int, int]) -> tuple[Pinhole, tuple[float, ...], tuple[str, ...]]:
     """Intrinsics, lens, and a note where they are assumed."""
-    file = beside(folder, INTRINSICS)
+    file = sidecar(folder, INTRINSICS)
     if file is not None:
         return read_intrinsics(file, size), (), ()
     match = re.search(r"(?<![a-z])(?:freiburg|fr)([123])(?!\d)", folder.resolve().name.lower())
@@ -171,41 +174,41 @@ def _camera(folder: Path, size: tuple[int, int]) -> tuple[Pinhole, tuple[float, 
     if match and size == _SIZE:
         return pinhole, lens, ()
     without = INTRINSICS if match else f"{INTRINSICS}, and no freiburg1, 2 or 3 in the folder's name"
-    return pinhole, lens, (published(pinhole, size, _SIZE, without),)
+    return pinhole, lens, (default_intrinsics(pinhole, size, _SIZE, without),)
 
 
 def _truth(
-    file: Path, stamps: Float[np.ndarray, " n"], limit: float
+    file: Path, timestamps: Float[np.ndarray, " n"], limit: float
 ) -> tuple[Float[np.ndarray, "n 4 4"] | None, tuple[str, ...]]:
     """The true poses nearest in time, and a note on frames without."""
     if not file.is_file():
-        return None, ("no groundtruth.txt: there is no truth to compare with",)
-    truth, form, _, repeated = read_trajectory(file)
+        return None, ("no groundtruth.txt: there is no ground truth to compare with",)
+    ground_truth, form, _, repeated = read_trajectory(file)
     if form != "TUM":
         raise DataError(f"{file}: expected lines of t tx ty tz qx qy qz qw, got a {form} file")
-    row = nearest(stamps, truth.t)
-    near = np.abs(truth.t[row] - stamps) < limit
-    poses = np.where(near[:, None, None], truth.T[row], np.nan)
-    names = [f"{t:.6f}" for t in stamps]
+    row = nearest(timestamps, ground_truth.t)
+    near = np.abs(ground_truth.t[row] - timestamps) < limit
+    poses = np.where(near[:, None, None], ground_truth.T[row], np.nan)
+    names = [f"{t:.6f}" for t in timestamps]
     checked, notes = usable_poses(poses, names, lambda i: str(file), f"none within {limit:g} s")
     if repeated:
-        notes += (f"{repeated} lines of groundtruth.txt repeat the stamp before them and are ignored",)
+        notes += (f"{repeated} lines of groundtruth.txt repeat the timestamp before them and are ignored",)
     return checked, notes
 
 
 def _accelerometer(
-    file: Path, stamps: Float[np.ndarray, " n"], T_world_cam: Float[np.ndarray, "n 4 4"] | None
+    file: Path, timestamps: Float[np.ndarray, " n"], T_world_cam: Float[np.ndarray, "n 4 4"] | None
 ) -> tuple[Accelerometer | None, tuple[str, ...]]:
-    """The readings on the frames' clock, in the camera's axes, and a note where the truth disagrees."""
+    """The readings on the frames' clock, in the camera's axes, and a note where ground truth disagrees."""
     if not file.is_file():
         return None, ()
     if all(line.startswith("#") or not line.strip() for line in file.read_text("utf-8-sig").splitlines()):
         return None, ("accelerometer.txt has no readings",)
     _, values = read_numbers(file, "4 numbers (t ax ay az)", (4,))
     values = values[np.argsort(values[:, 0], kind="stable")]
-    t, force_cam = values[:, 0] - stamps[0], values[:, 1:] @ _R_CAM_KINECT.T
+    t, force_cam = values[:, 0] - timestamps[0], values[:, 1:] @ _R_CAM_KINECT.T
     if T_world_cam is None:
         return Accelerometer(t, force_cam), ()
     gravity = np.array(GRAVITY_WORLD)
-    notes = gravity_note(t, force_cam, stamps - stamps[0], T_world_cam, gravity, "accelerometer.txt")
+    notes = gravity_note(t, force_cam, timestamps - timestamps[0], T_world_cam, gravity, "accelerometer.txt")
     return Accelerometer(t, force_cam), notes

@@ -1,4 +1,4 @@
-"""The events of a camera that circles the object of `orbit`, made on the fly: poses and stamps are exact.
+"""The events of a camera that circles the object of `orbit`, made on the fly: poses and timestamps are exact.
 
 It stands in for EventNeRF's synthetic turntables (METHOD section 6): one turn, poses at 1000 instants.
 """
@@ -41,9 +41,9 @@ def event_orbit(
     mask = mask / mask.sum(-1, keepdims=True)
 
     def images():
-        for stamp, T in zip(t, T_world_cam, strict=True):
+        for timestamp, T in zip(t, T_world_cam, strict=True):
             rgb = np.asarray(shot(jnp.asarray(T, jnp.float32)))
-            yield stamp, log_intensity((rgb * mask).sum(-1), OFFSET)
+            yield timestamp, log_intensity((rgb * mask).sum(-1), OFFSET)
 
     events = simulate(
         images(), THRESHOLD, spread=SPREAD, refractory_s=REFRACTORY_S, noise_hz=NOISE_HZ, seed=seed

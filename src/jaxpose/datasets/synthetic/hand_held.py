@@ -23,7 +23,7 @@ _HEIGHT = 1.38  # [m]
 _PITCH = 0.23  # downwards [rad]
 
 
-class Walk(NamedTuple):
+class HandHeldMotion(NamedTuple):
     """What differs from one walk to another."""
 
     speed: Float[AnyArray, ""]  # 1 is a stroll; may be negative to walk the other way round
@@ -32,15 +32,15 @@ class Walk(NamedTuple):
     look: Float[AnyArray, "3 3"]
 
 
-def draw(rng: np.random.Generator, speed: float) -> Walk:
+def draw(rng: np.random.Generator, speed: float) -> HandHeldMotion:
     """A walk at random: its direction, start and phases."""
     phases = lambda shape: np.asarray(rng.uniform(0, 2 * np.pi, shape))
-    return Walk(np.asarray(speed * rng.choice([-1, 1])), phases(()), phases((3, 2)), phases((3, 3)))
+    return HandHeldMotion(np.asarray(speed * rng.choice([-1, 1])), phases(()), phases((3, 2)), phases((3, 3)))
 
 
-def pose(walk: Walk, t: Float[Array, ""]) -> Float[Array, "4 4"]:
+def pose(walk: HandHeldMotion, t: Float[Array, ""]) -> Float[Array, "4 4"]:
     """`T_world_body` at `t` [s]; body axes are forwards, left, up."""
-    walk = Walk(*(jnp.asarray(x, t.dtype) for x in walk))
+    walk = HandHeldMotion(*(jnp.asarray(x, t.dtype) for x in walk))
     phase = t * jnp.abs(walk.speed)
 
     def waves(kind, phases):

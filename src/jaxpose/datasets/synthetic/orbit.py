@@ -1,4 +1,4 @@
-"""An object and the photographs of a camera that circles it, made on the fly: poses and stamps are exact.
+"""An object and the photographs of a camera that circles it, made on the fly: poses and timestamps are exact.
 
 It stands in for the paper's orbit around lego (METHOD section 6): the same path, another object.
 """
@@ -42,7 +42,7 @@ def orbit(views: int = 100, width: int = 128, seed: int = 0) -> tuple[Photograph
         T_world_cam = orbit_poses(t)
         rgb = [np.asarray(photograph(jnp.asarray(T, jnp.float32))) for T in T_world_cam]
         files = tuple(f"{part}/{index:03d}.png" for index in range(len(t)))
-        notes = (f"synthetic orbit, {len(t)} views of {width} x {width} px, exact poses and stamps",)
+        notes = (f"synthetic orbit, {len(t)} views of {width} x {width} px, exact poses and timestamps",)
         return Photographs(
             f"orbit {part}", lens, t, np.stack(rgb), T_world_cam, NEAR, FAR, "depth", files, notes
         )

@@ -1,4 +1,7 @@
-"""A recording of a furnished room made on the fly: colour, depth, truth and IMU along one analytic path."""
+"""A recording of a furnished room made on the fly.
+
+Colour, depth, ground truth and IMU along one analytic path.
+"""
 
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -13,7 +16,7 @@ from jaxpose.datasets.synthetic import hand_held, sensor
 from jaxpose.datasets.synthetic.atlas import Atlas, bake, gather, look_up
 from jaxpose.datasets.synthetic.furniture import Extent, furnish
 from jaxpose.datasets.synthetic.shapes import Shapes, cast, locate, within_cone
-from jaxpose.datasets.synthetic.trajectory import Drive, by_hand, recorded
+from jaxpose.datasets.synthetic.trajectory import Motion, by_hand, recorded
 from jaxpose.datasets.types import Frame, Recording
 from jaxpose.geometry.camera import Camera, pixel_direction
 from jaxpose.imu import ADIS16448, GRAVITY_WORLD, ImuNoise
@@ -86,7 +89,7 @@ def scenery(seed: int, size: Extent) -> tuple[Shapes, Atlas]:
     return shapes, bake(pieces, shapes, brush)
 
 
-def _drive(config: RoomConfig) -> Drive:
+def _drive(config: RoomConfig) -> Motion:
     if config.along is not None:
         return recorded(config.along, config.duration_s, config.rate_hz)
     t = np.arange(int(np.floor(config.duration_s * config.rate_hz + 1e-9)) + 1) / config.rate_hz

@@ -29,7 +29,7 @@ _EUROC_LEVER_ARM = (-0.0216, -0.0647, 0.0098)
 _AROUND, _ABOVE = 1.5, 1.2  # [m] free beside and over a recorded motion
 
 
-class Drive(NamedTuple):
+class Motion(NamedTuple):
     """A motion and its readings; the room is of a size that holds it."""
 
     name: str
@@ -42,14 +42,14 @@ class Drive(NamedTuple):
 
 
 def by_hand(
-    walk: hand_held.Walk,
+    walk: hand_held.HandHeldMotion,
     t: Float[np.ndarray, " n"],
     imu_rate_hz: float,
     noise: ImuNoise,
     gravity_world: tuple[float, float, float] = GRAVITY_WORLD,
     *,
     seed: int,
-) -> Drive:
+) -> Motion:
     """A walk around the room's middle, and its exact derivatives as readings up to the last frame."""
     samples = int(np.ceil(t[-1] * imu_rate_hz - 1e-9)) + 1
     with jax.enable_x64(True):
@@ -58,7 +58,7 @@ def by_hand(
         T_world_body, imu = np.asarray(T_world_body), Imu(*(np.array(x) for x in imu))
     # From right, down, forwards to forwards, left, up, not quite.
     turn = Rotation.from_rotvec(_MOUNTING).as_matrix() @ [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
-    return Drive("room", t, T_world_body, imu, _pose(turn, _LEVER_ARM), SIZE)
+    return Motion("room", t, T_world_body, imu, _pose(turn, _LEVER_ARM), SIZE)
 
 
 @partial(jax.jit, static_argnames=("noise", "gravity_world"))
@@ -68,7 +68,7 @@ def _readings(walk, frame_times, imu_times, key, noise, gravity_world):
     return jax.vmap(pose)(frame_times), imu
 
 
-def recorded(folder: Path | str, duration_s: float, rate_hz: float) -> Drive:
+def recorded(folder: Path | str, duration_s: float, rate_hz: float) -> Motion:
     """The motion and the readings, as recorded, of a EuRoC sequence (`imu0`, `state_groundtruth_estimate0`).
 
     From the first time that both know on; moved along the floor to the room's middle. The camera sits where
@@ -76,14 +76,16 @@ def recorded(folder: Path | str, duration_s: float, rate_hz: float) -> Drive:
     DataError where they have no two frames in common, or the motion goes below the floor.
     """
     folder = Path(folder)
-    imu, truth = euroc.load_imu(folder).imu, euroc.load_truth(folder)
-    first, last = max(imu.t[0], truth.t[0]), min(imu.t[-1], truth.t[-1])
+    imu, ground_truth = euroc.load_imu(folder).imu, euroc.load_truth(folder)
+    first, last = max(imu.t[0], ground_truth.t[0]), min(imu.t[-1], ground_truth.t[-1])
     t = np.arange(int(np.floor(min(duration_s, last - first) * rate_hz + 1e-9)) + 1) / rate_hz
     if len(t) < 2:
-        raise DataError(f"{folder}: expected two frames at {rate_hz:g} Hz within IMU and truth, got {len(t)}")
-    T_world_body = poses_at(Trajectory(truth.t, truth.T_world_body), np.asarray(first + t))
+        raise DataError(
+            f"{folder}: expected two frames at {rate_hz:g} Hz within IMU and ground truth, got {len(t)}"
+        )
+    T_world_body = poses_at(Trajectory(ground_truth.t, ground_truth.T_world_body), np.asarray(first + t))
     if np.isnan(T_world_body).any():
-        raise DataError(f"{folder}: expected truth without gaps above 0.1 s, found one")
+        raise DataError(f"{folder}: expected ground truth without gaps above 0.1 s, found one")
     lower, upper = (f(T_world_body[:, :3, 3], axis=0) for f in (np.min, np.max))
     if lower[2] < 0.05:
         raise DataError(f"{folder}: expected a motion above the floor (z = 0), got z = {lower[2]:.2f} m")
@@ -98,7 +100,7 @@ def recorded(folder: Path | str, duration_s: float, rate_hz: float) -> Drive:
         f"motion and IMU readings are those of {name}, {t[-1]:.1f} s from {first:.2f} s on; all images are "
         f"rendered, in a made-up room of {extent} m"
     )
-    return Drive(
+    return Motion(
         f"rendered room along {name}",
         t,
         T_world_body,

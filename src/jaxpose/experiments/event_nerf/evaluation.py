@@ -15,9 +15,9 @@ from jaxpose.evaluation.trajectory_error import PoseErrors
 from jaxpose.events import GAMMA, contrast, log_intensity
 from jaxpose.experiments.event_nerf.options import Problem
 from jaxpose.experiments.event_nerf.setup import Setup
-from jaxpose.experiments.image_metrics import likeness, means, pose_numbers
+from jaxpose.experiments.image_metrics import image_metrics, means, pose_numbers
 from jaxpose.experiments.training_loop import pose_reader
-from jaxpose.fields import set_progress, stamped
+from jaxpose.fields import piecewise_geodesic, set_progress
 from jaxpose.geometry.rigid import Similarity
 from jaxpose.plots.nerf import HeldOut
 from jaxpose.training import photometric
@@ -38,13 +38,13 @@ PROTOCOL = {
     "psnr, ssim, lpips": "mean over the held-out views, their true poses brought into the estimate's frame "
     "by the alignment, no test-time optimisation; first slope and offset of log intensity are fitted for "
     "each colour over all views, as EventNeRF does",
-    "frames": "the same numbers for the camera's own images during the events, rendered at their stamps",
+    "frames": "the same numbers for the camera's own images during the events, rendered at their timestamps",
     "slide": "way of the camera from first to last event in its own axes and its angle to the true way; "
     "variance of the warped events along multiples of that way, depths as rendered",
 }
 
 
-class Truth(NamedTuple):
+class GroundTruth(NamedTuple):
     """Some of the true poses during the events, and where the training starts at the same instants."""
 
     t: Float[np.ndarray, " m"]
@@ -53,29 +53,29 @@ class Truth(NamedTuple):
 
 
 class Measured(NamedTuple):
-    """The numbers, views to draw beside photographs, and where there is truth errors over time."""
+    """The numbers, views to draw beside photographs, and where there is ground truth errors over time."""
 
     numbers: dict[str, Any]
     held_out: list[HeldOut]
     frames: list[HeldOut]  # the camera's own
     at_start: PoseErrors | None
     at_end: PoseErrors | None
-    alignment: Similarity  # of the estimate with the truth; none where there is no truth
+    alignment: Similarity  # of the estimate with the ground truth; none where there is no ground truth
 
 
-def find_truth(problem: Problem) -> Truth | None:
+def find_truth(problem: Problem) -> GroundTruth | None:
     """None where fewer than three true poses are known during the events: an alignment would fit anything."""
     recording, (first, last) = problem.recording, problem.span
     during = np.flatnonzero((recording.t >= first) & (recording.t <= last))
     if len(during) < 3:
         return None
     at = during[np.unique(np.linspace(0, len(during) - 1, min(len(during), _MOST_POSES)).round().astype(int))]
-    start = stamped(*(jnp.asarray(x, jnp.float32) for x in problem.start))
+    start = piecewise_geodesic(*(jnp.asarray(x, jnp.float32) for x in problem.start))
     T_start = jax.jit(jax.vmap(start))(jnp.asarray(recording.t[at], jnp.float32))
-    return Truth(recording.t[at], recording.T_world_cam[at], np.asarray(T_start, np.float64))
+    return GroundTruth(recording.t[at], recording.T_world_cam[at], np.asarray(T_start, np.float64))
 
 
-def measure(problem: Problem, setup: Setup, state: State, truth: Truth | None) -> Measured:
+def measure(problem: Problem, setup: Setup, state: State, ground_truth: GroundTruth | None) -> Measured:
     """Errors of the trained trajectory, what the scene shows, and how sharp the motion makes the events."""
     scene = set_progress(state.scene, jnp.ones(()))
     recording = problem.recording
@@ -88,18 +88,18 @@ def measure(problem: Problem, setup: Setup, state: State, truth: Truth | None) -
     numbers: dict[str, Any] = {}
     to_truth = Similarity(1.0, np.eye(3), np.zeros(3))
     views, seen = [], {"psnr": None, "ssim": None, "lpips": None}
-    if truth is not None:
-        estimate = pose_reader(setup.field, truth.t)(state.pose)
-        at_end = trajectory_error.pose_errors(estimate, truth.T_world_cam)
-        at_start = trajectory_error.pose_errors(truth.T_start, truth.T_world_cam)
+    if ground_truth is not None:
+        estimate = pose_reader(setup.field, ground_truth.t)(state.pose)
+        at_end = trajectory_error.pose_errors(estimate, ground_truth.T_world_cam)
+        at_start = trajectory_error.pose_errors(ground_truth.T_start, ground_truth.T_world_cam)
         extent = problem.about["extent"]
         numbers = pose_numbers(at_end, extent) | {"start": pose_numbers(at_start, extent)}
         numbers["constant_rotation_error_deg"] = constant_rotation_deg(
-            trajectory_error.align(at_end.alignment, estimate), truth.T_world_cam
+            trajectory_error.align(at_end.alignment, estimate), ground_truth.T_world_cam
         )
         to_truth = at_end.alignment
         if recording.held_out is not None:
-            to_estimate = trajectory_error.procrustes(truth.T_world_cam, estimate)
+            to_estimate = trajectory_error.procrustes(ground_truth.T_world_cam, estimate)
             poses = trajectory_error.align(to_estimate, recording.held_out.T_world_cam)
             views = _seen(look(recording.held_out.camera), scene, recording.held_out, poses, setup)
             seen = _alike(views)
@@ -113,30 +113,32 @@ def measure(problem: Problem, setup: Setup, state: State, truth: Truth | None) -
             frames = _seen(look(recording.camera), scene, photographs, poses, setup)
             numbers["frames"] = _alike(frames)
     if problem.slides:
-        numbers["slide"] = _slide(problem, setup, state, scene, truth, look(recording.camera))
+        numbers["slide"] = _slide(problem, setup, state, scene, ground_truth, look(recording.camera))
     return Measured(numbers, views, frames, at_start, at_end, to_truth)
 
 
-def constant_rotation_deg(estimate: Float[np.ndarray, "m 4 4"], truth: Float[np.ndarray, "m 4 4"]) -> float:
+def constant_rotation_deg(
+    estimate: Float[np.ndarray, "m 4 4"], ground_truth: Float[np.ndarray, "m 4 4"]
+) -> float:
     """Angle of the mean turn from true to estimated orientations, in camera axes: a wrong axis leaves it."""
-    turns = np.swapaxes(truth[:, :3, :3], 1, 2) @ estimate[:, :3, :3]
+    turns = np.swapaxes(ground_truth[:, :3, :3], 1, 2) @ estimate[:, :3, :3]
     return float(np.degrees(Rotation.from_matrix(turns).mean().magnitude()))
 
 
 def corrected(
-    rendered: Float[np.ndarray, "n h w 3"], truth: Float[np.ndarray, "n h w 3"], offset: float
+    rendered: Float[np.ndarray, "n h w 3"], ground_truth: Float[np.ndarray, "n h w 3"], offset: float
 ) -> Float[np.ndarray, "n h w 3"]:
-    """Renders in [0, 1] whose log intensity is mapped to the truth's by a slope and an offset per colour.
+    """Renders in [0, 1] whose log intensity is mapped to ground truth's by a slope and an offset per colour.
 
     Events tell changes only: brightness and contrast of what is made from them are not known. Least squares
     over all views (EventNeRF, PEERS B4).
     """
     result = np.empty_like(rendered)
     for colour in range(3):
-        x, y = (log_intensity(images[..., colour], offset).ravel() for images in (rendered, truth))
+        x, y = (log_intensity(images[..., colour], offset).ravel() for images in (rendered, ground_truth))
         slope, level = np.polynomial.polynomial.polyfit(x, y, 1)[::-1] if np.ptp(x) > 0 else (0.0, y.mean())
         intensity = np.exp(slope * x + level) - offset
-        result[..., colour] = np.clip(intensity, 0, 1).reshape(truth.shape[:3]) ** (1 / GAMMA)
+        result[..., colour] = np.clip(intensity, 0, 1).reshape(ground_truth.shape[:3]) ** (1 / GAMMA)
     return result
 
 
@@ -160,13 +162,18 @@ def _seen(
 
 
 def _alike(views: list[HeldOut]) -> dict[str, float | None]:
-    return means([likeness(view.rendered_rgb, view.rgb / 255) for view in views])
+    return means([image_metrics(view.rendered_rgb, view.rgb / 255) for view in views])
 
 
 def _slide(
-    problem: Problem, setup: Setup, state: State, scene: Any, truth: Truth | None, image: Callable[..., Any]
+    problem: Problem,
+    setup: Setup,
+    state: State,
+    scene: Any,
+    ground_truth: GroundTruth | None,
+    image: Callable[..., Any],
 ) -> dict[str, Any]:
-    """The direction of a short motion against the truth's, and contrasts along multiples of the motion.
+    """The direction of a short motion against ground truth's, and contrasts along multiples of the motion.
 
     Events are carried by the scene's own depth from the middle of the time.
     """
@@ -187,9 +194,9 @@ def _slide(
         "way": way,
         "contrast": {f"{k:g}": float(contrast_of(jnp.asarray(k * way, jnp.float32))) for k in _MULTIPLES},
     }
-    if truth is None:
+    if ground_truth is None:
         return result
-    T_true = truth.T_world_cam
+    T_true = ground_truth.T_world_cam
     true_way = T_true[len(T_true) // 2, :3, :3].T @ (T_true[-1, :3, 3] - T_true[0, :3, 3])
     begins = problem.start.T[-1, :3, 3] - problem.start.T[0, :3, 3]
     return result | {

@@ -16,7 +16,7 @@ from jaxpose.datasets.synthetic.orbit import DIAMETER, FAR, NEAR
 from jaxpose.datasets.types import EventRecording
 from jaxpose.errors import DataError
 from jaxpose.events import Mosaic
-from jaxpose.events.contrast import find_slide
+from jaxpose.events.contrast import find_displacement
 from jaxpose.experiments.command import check_least, check_resume
 from jaxpose.experiments.training_loop import CHUNK, NetConfig
 from jaxpose.files.trajectories import Trajectory
@@ -58,7 +58,7 @@ class Config:
     study: Study | None = None  # table 4 (known: 20, 10 and 6 instants), or offsets, both fields side by side
     resume: bool = False  # go on where a killed run stopped
     smoke: bool = False  # everything shrunk to seconds; the numbers then mean nothing
-    out: Path | None = None  # exactly this folder; None: outputs/event_nerf/<name or time stamp>
+    out: Path | None = None  # exactly this folder; None: outputs/event_nerf/<name or timestamp>
     name: str | None = None  # of the run folder
 
     def __post_init__(self):
@@ -80,7 +80,7 @@ class Config:
 _INCIDENTAL = ("resume", "out", "name", "study")
 
 
-def decisive(config: Config) -> dict[str, Any]:
+def resume_fingerprint(config: Config) -> dict[str, Any]:
     """The settings that a resumed run must share with the one it resumes."""
     return {f.name: getattr(config, f.name) for f in fields(config) if f.name not in _INCIDENTAL}
 
@@ -163,7 +163,7 @@ class _Began(NamedTuple):
 
 def _unknown(recording: EventRecording) -> _Began:
     """The slide that makes events sharpest, from the middle of the time at the world's origin."""
-    slide = find_slide(recording.camera, recording.events)
+    slide = find_displacement(recording.camera, recording.events)
     ends = recording.events.t[[0, -1]]
     T_start = np.tile(np.eye(4), (2, 1, 1))
     T_start[:, :3, 3] = (ends - ends.mean())[:, None] * slide.velocity
@@ -208,12 +208,12 @@ def _inexact(
     recording: EventRecording, known: int | None, offset_deg: float
 ) -> tuple[Float[np.ndarray, "k 4 4"], str]:
     """The recording's poses with positions on straight lines between known ones, about a wrong axis."""
-    truth, t = recording.T_world_cam, recording.t
-    T_start, words = truth.copy(), [f"known at all {len(t)} instants"]
+    ground_truth, t = recording.T_world_cam, recording.t
+    T_start, words = ground_truth.copy(), [f"known at all {len(t)} instants"]
     if known is not None:
         at = np.round(np.linspace(0, len(t) - 1, known + recording.cyclic)).astype(int)
         for axis in range(3):
-            T_start[:, axis, 3] = np.interp(t, t[at], truth[at, axis, 3])
+            T_start[:, axis, 3] = np.interp(t, t[at], ground_truth[at, axis, 3])
         words = [f"positions known at {known} instants, linear between, orientations kept"]
     if offset_deg:
         # All that a camera knows of a turntable is where it sees the axis: turned about its own y axis.

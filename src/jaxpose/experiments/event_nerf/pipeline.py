@@ -17,8 +17,16 @@ import numpy as np
 
 from jaxpose.evaluation import trajectory_error
 from jaxpose.experiments import command, training_loop
-from jaxpose.experiments.event_nerf.evaluation import PROTOCOL, Measured, Truth, find_truth, measure
-from jaxpose.experiments.event_nerf.options import Config, Problem, Study, begin, decisive, load, read
+from jaxpose.experiments.event_nerf.evaluation import PROTOCOL, GroundTruth, Measured, find_truth, measure
+from jaxpose.experiments.event_nerf.options import (
+    Config,
+    Problem,
+    Study,
+    begin,
+    load,
+    read,
+    resume_fingerprint,
+)
 from jaxpose.experiments.event_nerf.report import progress_bar, report, table
 from jaxpose.experiments.event_nerf.setup import Setup, build, describe
 from jaxpose.experiments.training_loop import Loaded, OnProgress, Outcome, Trained
@@ -83,14 +91,14 @@ def _single(
     """One training, measured and written; what a killed or finished run has left is used with `resume`."""
     started = time.perf_counter()
     finished = folder / "results.json"
-    training_loop.prepare(folder, config, decisive(config), resume=config.resume)
+    training_loop.set_up_run_folder(folder, config, resume_fingerprint(config), resume=config.resume)
     if finished.exists():
         return json.loads(finished.read_text())
     setup = build(config, problem)
-    truth = find_truth(problem)
-    trained = _train(config, problem, setup, truth, folder / "checkpoint.npz", on_progress, label)
-    measured = measure(problem, setup, trained.state, truth)
-    _draw(folder, config, problem, measured, truth)
+    ground_truth = find_truth(problem)
+    trained = _train(config, problem, setup, ground_truth, folder / "checkpoint.npz", on_progress, label)
+    measured = measure(problem, setup, trained.state, ground_truth)
+    _draw(folder, config, problem, measured, ground_truth)
     _write_poses(folder, problem, setup, trained.state, measured)
     results = training_loop.results_of(
         "event_nerf",
@@ -110,20 +118,20 @@ def _train(
     config: Config,
     problem: Problem,
     setup: Setup,
-    truth: Truth | None,
+    ground_truth: GroundTruth | None,
     checkpoint: Path,
     on_progress: OnProgress | None,
     label: str,
 ) -> Trained:
-    if truth is None:
+    if ground_truth is None:
         errors = lambda params: (np.nan, np.nan)
     else:
-        poses = training_loop.pose_reader(setup.field, truth.t)
-        errors = lambda params: training_loop.mean_errors(poses(params), truth.T_world_cam)
+        poses = training_loop.pose_reader(setup.field, ground_truth.t)
+        errors = lambda params: training_loop.mean_errors(poses(params), ground_truth.T_world_cam)
 
     return training_loop.train(
         setup,
-        training_loop.fresh(setup, config.seed),
+        training_loop.initial_state(setup, config.seed),
         setup.data,
         errors,
         checkpoint,
@@ -133,13 +141,15 @@ def _train(
     )
 
 
-def _draw(folder: Path, config: Config, problem: Problem, measured: Measured, truth: Truth | None) -> None:
+def _draw(
+    folder: Path, config: Config, problem: Problem, measured: Measured, ground_truth: GroundTruth | None
+) -> None:
     numbers, about, recording = measured.numbers, problem.about, problem.recording
     title = f"{about['data']}, {about['events']} events\n{about['poses']}"
     method = f"{config.pose}, {config.loss} loss"
     camera = recording.camera
     event_plots.windows(folder / "events.png", recording.events, camera.height, camera.width, title)
-    if truth is not None and measured.at_start is not None and measured.at_end is not None:
+    if ground_truth is not None and measured.at_start is not None and measured.at_end is not None:
         before, after = (
             (errors.rotation_errors_deg, errors.translation_errors)
             for errors in (measured.at_start, measured.at_end)
@@ -149,7 +159,7 @@ def _draw(folder: Path, config: Config, problem: Problem, measured: Measured, tr
             f"{numbers['translation_error']:.4f} units, rotation "
             f"{numbers['start']['rotation_error_deg']:.2f} to {numbers['rotation_error_deg']:.2f} deg"
         )
-        event_plots.errors(folder / "pose_errors.png", truth.t, before, after, f"{title}\n{found}")
+        event_plots.errors(folder / "pose_errors.png", ground_truth.t, before, after, f"{title}\n{found}")
     if measured.held_out:
         about_views = f"{title}\n{method}, held-out PSNR {numbers['psnr']:.2f} dB"
         nerf_plots.held_out(folder / "held_out.png", measured.held_out, about_views)
@@ -161,7 +171,10 @@ def _draw(folder: Path, config: Config, problem: Problem, measured: Measured, tr
 
 
 def _write_poses(folder: Path, problem: Problem, setup: Setup, state: State, measured: Measured) -> None:
-    """The trajectory, aligned with the truth where there is any, at its stamps and as a continuous field."""
+    """The trajectory, aligned with ground truth where there is any.
+
+    At its timestamps and as a continuous field.
+    """
     recording, (first, last) = problem.recording, problem.span
     t = recording.t[(recording.t >= first) & (recording.t <= last)]
     if len(t) < 2:

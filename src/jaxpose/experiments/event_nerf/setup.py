@@ -12,7 +12,7 @@ from jaxpose import events, fields
 from jaxpose.experiments.event_nerf.options import Config, Problem
 from jaxpose.experiments.training_loop import CHUNK
 from jaxpose.fields import Params, PoseField, PoseNetConfig
-from jaxpose.fields.serialization import Factor, posenet_factor, stamped_factor
+from jaxpose.fields.serialization import Factor, piecewise_geodesic_factor, posenet_factor
 from jaxpose.scenes import NerfConfig, SceneField, nerf
 from jaxpose.training import events as event_training
 from jaxpose.training.events import EventData, EventTrainConfig
@@ -25,7 +25,7 @@ _SMOKE_SCENE = NerfConfig(layers=2, width=16, skip=None, colour_width=8, octaves
 _FAST_SCENE = NerfConfig(layers=4, width=96, skip=2, colour_width=48, octaves=7, quiet=True)
 
 
-class Plan(NamedTuple):
+class Preset(NamedTuple):
     """A scene, and Adam's first and last rate and its start for the poses, by what is wrong with them."""
 
     scene: NerfConfig
@@ -33,16 +33,16 @@ class Plan(NamedTuple):
     rotation: Rate
 
 
-_PAPER_PLAN = Plan(NerfConfig(), Rate(2e-4, 2e-6), Rate(5e-5, 5e-7))
-_FAST_PLANS = {
+_PAPER_PRESET = Preset(NerfConfig(), Rate(2e-4, 2e-6), Rate(5e-5, 5e-7))
+_FAST_PRESETS = {
     # Orientations are known: a turn that came as fast as a shift would be taken for one. The scene stays
     # blurred until the cameras are where it is seen.
-    "positions": Plan(
+    "positions": Preset(
         replace(_FAST_SCENE, window=(0.2, 0.7)), Rate(3e-3, 1e-4, 0.03), Rate(1e-6, 1e-7, 0.06)
     ),
-    "axis": Plan(replace(_FAST_SCENE, window=(0.1, 0.5)), Rate(1e-3, 3e-5, 0.03), Rate(3e-5, 2e-6, 0.06)),
+    "axis": Preset(replace(_FAST_SCENE, window=(0.1, 0.5)), Rate(1e-3, 3e-5, 0.03), Rate(3e-5, 2e-6, 0.06)),
     # A short slide is a small angle: turns of its size must come as slowly as it, after the scene.
-    "all": Plan(replace(_FAST_SCENE, window=(0.1, 0.5)), Rate(3e-4, 2e-5, 0.3), Rate(1e-6, 1e-7, 0.3)),
+    "all": Preset(replace(_FAST_SCENE, window=(0.1, 0.5)), Rate(3e-4, 2e-5, 0.3), Rate(1e-6, 1e-7, 0.3)),
 }
 
 
@@ -61,7 +61,7 @@ class Setup(NamedTuple):
 def build(config: Config, problem: Problem) -> Setup:
     """Scene, pose field, rates and data that the config names, for these events."""
     recording, paper = problem.recording, config.preset == "paper"
-    plan = _plan(config, problem)
+    plan = _preset(config, problem)
     if config.smoke:
         scene, train = nerf(_SMOKE_SCENE), _SMOKE
     else:
@@ -106,18 +106,18 @@ def describe(config: Config, setup: Setup) -> dict[str, Any]:
     }
 
 
-def _plan(config: Config, problem: Problem) -> Plan:
+def _preset(config: Config, problem: Problem) -> Preset:
     if config.preset == "paper":
-        return _PAPER_PLAN
-    return _FAST_PLANS["all" if problem.slides else "axis" if config.axis_offset_deg else "positions"]
+        return _PAPER_PRESET
+    return _FAST_PRESETS["all" if problem.slides else "axis" if config.axis_offset_deg else "positions"]
 
 
 def _field(
-    config: Config, problem: Problem, plan: Plan
+    config: Config, problem: Problem, plan: Preset
 ) -> tuple[PoseField, Callable[[Params], tuple[Factor, ...]], dict[str, Rate]]:
     """The trajectory as a field and as factors of its file, and the rates of its parameters."""
     t, T_start = (jnp.asarray(x, jnp.float32) for x in problem.start)
-    initial, start = fields.stamped(t, T_start), stamped_factor(t, T_start)
+    initial, start = fields.piecewise_geodesic(t, T_start), piecewise_geodesic_factor(t, T_start)
     if config.pose == "linear":
         return PoseField(lambda key: {}, lambda params, t: initial(t)), lambda params: (start,), {}
     net = replace(config.net, layers=2, width=32) if config.smoke else config.net
@@ -137,7 +137,9 @@ def _data(problem: Problem) -> EventData:
     recording, span = problem.recording, problem.span
     width, height = recording.camera.width, recording.camera.height
     inside = (recording.events.t >= span[0]) & (recording.events.t <= span[1])
-    streams = events.by_pixel(events.Events(*(column[inside] for column in recording.events)), height, width)
+    streams = events.index_by_pixel(
+        events.Events(*(column[inside] for column in recording.events)), height, width
+    )
     streams = jax.tree.map(
         lambda x: jnp.asarray(x, jnp.float32 if np.issubdtype(x.dtype, np.floating) else jnp.int32), streams
     )

@@ -1,4 +1,4 @@
-"""How good a training is: pose errors against the truth, held-out views with and without settling them."""
+"""How good a training is: pose errors against ground truth, held-out views with and without settling them."""
 
 from typing import Any, NamedTuple
 
@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from jaxpose.evaluation import trajectory_error
-from jaxpose.experiments.image_metrics import likeness, means, pose_numbers
+from jaxpose.experiments.image_metrics import image_metrics, means, pose_numbers
 from jaxpose.experiments.noisy_nerf.options import Config, Problem
 from jaxpose.experiments.noisy_nerf.setup import Setup
 from jaxpose.fields import set_progress
@@ -31,7 +31,7 @@ PROTOCOL = {
 
 
 class Measured(NamedTuple):
-    """The numbers, the held-out views to draw, and poses aligned with the truth."""
+    """The numbers, the held-out views to draw, and poses aligned with the ground truth."""
 
     numbers: dict[str, Any]
     views: list[HeldOut]
@@ -44,10 +44,10 @@ def measure(
     config: Config, problem: Problem, setup: Setup, state: State, T_world_cam: Float[np.ndarray, "n 4 4"]
 ) -> Measured:
     """Errors of the trained poses, and of what the scene shows from held-out ones."""
-    truth = problem.train.T_world_cam
-    errors = trajectory_error.pose_errors(T_world_cam, truth)
-    at_start = trajectory_error.pose_errors(problem.T_start, truth)
-    to_estimate = trajectory_error.procrustes(truth, T_world_cam)
+    ground_truth = problem.train.T_world_cam
+    errors = trajectory_error.pose_errors(T_world_cam, ground_truth)
+    at_start = trajectory_error.pose_errors(problem.T_start, ground_truth)
+    to_estimate = trajectory_error.procrustes(ground_truth, T_world_cam)
     viewer = photometric.viewer(
         setup.scene,
         problem.train.camera,
@@ -107,6 +107,6 @@ def _seen(
     rendered = np.clip(np.asarray(rgb, np.float64), 0, 1)
     photograph = problem.held_out.rgb[index]
     label = problem.held_out.files[index]
-    return likeness(rendered, photograph / 255), HeldOut(
+    return image_metrics(rendered, photograph / 255), HeldOut(
         label, photograph, rendered, np.asarray(depth, np.float64)
     )

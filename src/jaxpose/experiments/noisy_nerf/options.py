@@ -54,7 +54,7 @@ class Config:
     study: Study | None = None  # runs of table 11 (fields), 3 (encoding), 12 (size), 10 (spline) side by side
     resume: bool = False  # go on where a killed run stopped
     smoke: bool = False  # everything shrunk to seconds; the numbers then mean nothing
-    out: Path | None = None  # exactly this folder; None: outputs/noisy_nerf/<name or time stamp>
+    out: Path | None = None  # exactly this folder; None: outputs/noisy_nerf/<name or timestamp>
     name: str | None = None  # of the run folder
 
     def __post_init__(self):
@@ -76,7 +76,7 @@ class Config:
 _INCIDENTAL = ("resume", "out", "name", "study")
 
 
-def decisive(config: Config) -> dict[str, Any]:
+def resume_fingerprint(config: Config) -> dict[str, Any]:
     """The settings that a resumed run must share with the one it resumes."""
     return {f.name: getattr(config, f.name) for f in fields(config) if f.name not in _INCIDENTAL}
 
@@ -149,15 +149,15 @@ def _middle(photographs: Photographs) -> float:
 
 def _disturbed(config: Config, train: Photographs, extent: float) -> tuple[Float[np.ndarray, "n 4 4"], str]:
     """The poses to start from, and what was done to them."""
-    truth = train.T_world_cam
+    ground_truth = train.T_world_cam
     if config.noise == "none":
-        return truth, "none: the poses of the data"
+        return ground_truth, "none: the poses of the data"
     if config.noise == "unknown":
-        T_same = np.tile(np.eye(4), (len(truth), 1, 1))
+        T_same = np.tile(np.eye(4), (len(ground_truth), 1, 1))
         T_same[:, 2, 3] = -_middle(train)
         return T_same, "poses unknown: all start in one place"
     if config.noise == "independent":
-        T_noise = pose_noise.independent(len(truth), config.noise_sigma, config.seed)
+        T_noise = pose_noise.independent(len(ground_truth), config.noise_sigma, config.seed)
         words = f"independent, twists of N(0, {config.noise_sigma:g}^2) [scene units and rad]"
     else:
         T_noise = pose_noise.correlated(
@@ -172,6 +172,6 @@ def _disturbed(config: Config, train: Photographs, extent: float) -> tuple[Float
         )
     words += f", on the {config.side}'s side, seed {config.seed}"
     if config.side == "camera":
-        return truth @ T_noise, words
+        return ground_truth @ T_noise, words
     # World-to-camera this is T_c,w . T_noise, as in the supplement's section 6.
-    return np.linalg.inv(T_noise) @ truth, words
+    return np.linalg.inv(T_noise) @ ground_truth, words

@@ -21,7 +21,7 @@ from jaxpose.datasets.photos import blender
 from jaxpose.datasets.photos.transforms_json import write_transforms
 from jaxpose.experiments import command, training_loop
 from jaxpose.experiments.noisy_nerf.evaluation import PROTOCOL, Measured, measure
-from jaxpose.experiments.noisy_nerf.options import ORBIT, Config, Problem, decisive, load
+from jaxpose.experiments.noisy_nerf.options import ORBIT, Config, Problem, load, resume_fingerprint
 from jaxpose.experiments.noisy_nerf.report import progress_bar, report, table
 from jaxpose.experiments.noisy_nerf.setup import Setup, build, describe, splined
 from jaxpose.experiments.noisy_nerf.studies import STUDIES
@@ -72,7 +72,7 @@ def train(
 
     return training_loop.train(
         setup,
-        training_loop.fresh(setup, config.seed),
+        training_loop.initial_state(setup, config.seed),
         setup.views,
         lambda params: training_loop.mean_errors(poses(params), problem.train.T_world_cam),
         checkpoint,
@@ -100,7 +100,7 @@ def _single(
     """One training, measured and written; what a killed or finished run has left is used with `resume`."""
     started = time.perf_counter()
     checkpoint, finished = folder / "checkpoint.npz", folder / "results.json"
-    training_loop.prepare(folder, config, decisive(config), resume=config.resume)
+    training_loop.set_up_run_folder(folder, config, resume_fingerprint(config), resume=config.resume)
     if finished.exists():
         return json.loads(finished.read_text())
     setup = build(config, problem)
@@ -134,9 +134,9 @@ def _draw(folder: Path, config: Config, problem: Problem, measured: Measured, tr
         f"{numbers['start']['translation_error_percent']:.2f} to "
         f"{numbers['translation_error_percent']:.3f}% of the cameras' extent"
     )
-    truth = problem.train.T_world_cam
+    ground_truth = problem.train.T_world_cam
     nerf_plots.cameras(
-        folder / "cameras.png", truth, measured.T_start, measured.T_estimate, f"{title}\n{found}"
+        folder / "cameras.png", ground_truth, measured.T_start, measured.T_estimate, f"{title}\n{found}"
     )
     psnr = f"{config.pose}, held-out PSNR {numbers['psnr']:.2f} dB"
     nerf_plots.held_out(folder / "held_out.png", measured.views, f"{title}\n{psnr}")

@@ -16,7 +16,13 @@ from jaxpose import fields
 from jaxpose.experiments.noisy_nerf.options import Config, Problem
 from jaxpose.experiments.training_loop import CHUNK
 from jaxpose.fields import Params, PoseField, PoseNetConfig
-from jaxpose.fields.serialization import Factor, bspline_factor, posenet_factor, stamped_factor, table_factor
+from jaxpose.fields.serialization import (
+    Factor,
+    bspline_factor,
+    per_frame_factor,
+    piecewise_geodesic_factor,
+    posenet_factor,
+)
 from jaxpose.scenes import NerfConfig, SceneField, nerf
 from jaxpose.training.photometric import Depths, TrainConfig, Views, trainer
 from jaxpose.training.steps import Rate, Trainer
@@ -77,9 +83,9 @@ def build(config: Config, problem: Problem) -> Setup:
     t = jnp.asarray(photographs.t, jnp.float32)
     field, factor, rates = _field(config, problem)
     T_start = jnp.asarray(problem.T_start, jnp.float32)
-    start = stamped_factor(t, T_start)
+    start = piecewise_geodesic_factor(t, T_start)
     world = config.side == "world"
-    field = fields.refine(field, fields.stamped(t, T_start), side="world" if world else "body")
+    field = fields.refine(field, fields.piecewise_geodesic(t, T_start), side="world" if world else "body")
     depths = Depths(photographs.near, photographs.far, photographs.spacing)
     return Setup(
         scene,
@@ -164,7 +170,7 @@ def _field(config: Config, problem: Problem) -> tuple[PoseField, Callable[[Param
         factor = partial(bspline_factor, span)
     else:
         field, columns = fields.table(photographs.t), (3, 3)
-        factor = partial(table_factor, photographs.t)
+        factor = partial(per_frame_factor, photographs.t)
     pairs = zip((*shift, shift_from), (*turn, turn_from), strict=True)
     return field, factor, Rate(*(np.repeat(pair, columns)[None] for pair in pairs))
 

@@ -41,7 +41,7 @@ _STEPS = {"paper": 2000, "homography": 5000}
 _SMOKE_STEPS, _SMOKE_MOTIONS = 100, 2
 _SMOKE_IMAGE, _SMOKE_NET = ImageConfig(layers=3, width=32), PoseNetConfig(layers=2, width=32)
 # What a motion's numbers depend on, beside its own number.
-_DECISIVE = ("image", "setup", "pose", "seed", "steps", "points", "smoke")
+_RESUME_FINGERPRINT = ("image", "setup", "pose", "seed", "steps", "points", "smoke")
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Config:
     points: int = 128  # random pixels of each patch in a step
     resume: bool = False  # keep the motions that a killed run has finished
     smoke: bool = False  # everything shrunk to seconds; the numbers then mean nothing
-    out: Path | None = None  # exactly this folder; None: outputs/planar/<name or time stamp>
+    out: Path | None = None  # exactly this folder; None: outputs/planar/<name or timestamp>
     name: str | None = None  # of the run folder
 
     def __post_init__(self):
@@ -202,13 +202,15 @@ def _motion(
 
 def _prepare(folder: Path, config: Config) -> None:
     """Leave in the folder the config, and finished motions only if they are to be kept and are this run's."""
-    decisive = {name: value for name, value in asdict(config).items() if name in _DECISIVE}
-    decisive["image"] = str(Path(decisive["image"]).resolve())
+    resume_fingerprint = {
+        name: value for name, value in asdict(config).items() if name in _RESUME_FINGERPRINT
+    }
+    resume_fingerprint["image"] = str(Path(resume_fingerprint["image"]).resolve())
     stored = folder / "motions" / "settings.json"
-    if not command.resumes(folder, stored, decisive, config.resume):
+    if not command.resumes(folder, stored, resume_fingerprint, config.resume):
         for file in (folder / "motions").glob("*.json"):
             file.unlink()
-        atomic.write_json(stored, decisive)
+        atomic.write_json(stored, resume_fingerprint)
     atomic.write_json(folder / "config.json", config)
 
 
@@ -243,7 +245,11 @@ def _draw(
     start = np.eye(3)[None]
     outlines = {
         name: planar_task.apply(H, planar_task.corners(photo)) * photo.unit + [width / 2, height / 2]
-        for name, H in (("truth", task.H_image_patch), ("start", start), ("estimate", aligned.H_image_patch))
+        for name, H in (
+            ("ground_truth", task.H_image_patch),
+            ("start", start),
+            ("estimate", aligned.H_image_patch),
+        )
     }
     before, after = numbers["start_corner_error_px"], numbers["corner_error_px"]
     title = (

@@ -58,8 +58,10 @@ def protocol(setup: str, photo: Photo, path: Path, steps: int, points: int, warp
         "patch_px": photo.crop,
         "motions": PROTOCOL[setup],
         "start": "the identity, that is the centre crop, for all patches",
-        "gauge": "patch 0 is the centre crop in truth and in the estimate, the others are relative to it",
-        "corner_error": "distance of the four warped corners from the truth, mean over corners and over all "
+        "gauge": "patch 0 is the centre crop in ground truth and in the estimate, the others are "
+        "relative to it",
+        "corner_error": "distance of the four warped corners from ground truth, mean over corners "
+        "and over all "
         "patches but patch 0, whose error is zero by construction; no alignment afterwards",
         "success": f"corner error below {SUCCESS_PX:g} px",
         "psnr": "of all pixels of all patches, patch 0 included",

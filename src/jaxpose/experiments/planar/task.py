@@ -48,7 +48,7 @@ class Photo(NamedTuple):
 
 
 class Task(NamedTuple):
-    """Patches to align, and the truth; patch 0 is the centre crop itself."""
+    """Patches to align, and the ground truth; patch 0 is the centre crop itself."""
 
     H_image_patch: Float[np.ndarray, "n 3 3"]
     rgb: Float[np.ndarray, "n p 3"]  # colours at the points of `pixels`, in [0, 1]
@@ -116,10 +116,10 @@ def cut(photo: Photo, H_image_patch: Float[np.ndarray, "n 3 3"]) -> Float[np.nda
 
 
 def corner_errors(
-    photo: Photo, estimate: Float[np.ndarray, "n 3 3"], truth: Float[np.ndarray, "n 3 3"]
+    photo: Photo, estimate: Float[np.ndarray, "n 3 3"], ground_truth: Float[np.ndarray, "n 3 3"]
 ) -> Float[np.ndarray, " n"]:
     """Mean distance [px] of each patch's four corners from where they should be in the image."""
-    offset = apply(estimate, corners(photo)) - apply(truth, corners(photo))
+    offset = apply(estimate, corners(photo)) - apply(ground_truth, corners(photo))
     return np.linalg.norm(offset, axis=-1).mean(axis=1) * photo.unit
 
 

@@ -38,19 +38,19 @@ def motion_warps(pose: Pose, patches: int, net: PoseNetConfig) -> Warps:
     Of a pose the translation in x and y counts, and the rotation about z nearest to its own. All warps are
     relative to the first, which fixes the gauge; the table's first row stays zero, as BARF has it.
     """
-    stamps = np.linspace(-1, 1, patches)
+    timestamps = np.linspace(-1, 1, patches)
     if pose == "posenet":
         # A third and a half of METHOD's rates for NeRF, with which the field may run out of the image.
         field, rates, fall = fields.posenet(net), {"translation": 3e-4, "rotation": 1e-4}, 0.03
     elif pose == "bspline":
         field, rates, fall = fields.bspline((-1.0, 1.0), SPLINE_KNOTS - 1), _BARF, 0.03
     else:
-        field, rates, fall = fields.table(stamps), _BARF, 0.03
+        field, rates, fall = fields.table(timestamps), _BARF, 0.03
 
     def warps(params):
         if pose in ("table", "spline_reset"):
             params = params.at[0].set(0)
-        times = jnp.asarray(stamps, jax.tree.leaves(params)[0].dtype)
+        times = jnp.asarray(timestamps, jax.tree.leaves(params)[0].dtype)
         return _since_first(planar(jax.vmap(field.pose, (None, 0))(params, times)))
 
     reset = spline_projection(patches, SPLINE_KNOTS) if pose == "spline_reset" else None

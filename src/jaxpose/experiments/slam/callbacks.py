@@ -25,7 +25,9 @@ _SHARE = 0.02  # of the time that previews may take
 _WIDTH = 80  # [px] of the map in a preview
 
 
-def keeper(folder: Path, recording: Recording, settings: dict[str, Any]) -> Callable[[Progress], None]:
+def checkpoint_callback(
+    folder: Path, recording: Recording, settings: dict[str, Any]
+) -> Callable[[Progress], None]:
     """A callback that writes the settings once, and checkpoint and preview every few seconds."""
     saved = time.perf_counter()
     next_preview = 0.0

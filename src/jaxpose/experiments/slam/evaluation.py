@@ -41,7 +41,7 @@ class Freedom(NamedTuple):
 
 
 class Accuracy(NamedTuple):
-    """Errors against the truth after SE(3) alignment, frame by frame and as numbers for the results."""
+    """Errors against ground truth after SE(3) alignment, frame by frame and as numbers for the results."""
 
     aligned: Float[np.ndarray, "n 4 4"]
     translation_m: Float[np.ndarray, " n"]
@@ -50,7 +50,10 @@ class Accuracy(NamedTuple):
 
 
 class Measured(NamedTuple):
-    """What there was to measure: errors against a truth, an IMU against the field, the intrinsic motion."""
+    """What there was to measure.
+
+    Errors against ground truth, an IMU against the field, the intrinsic motion.
+    """
 
     errors: Accuracy | None
     inertial: Inertial | None
@@ -132,7 +135,7 @@ def accuracy(
 def _drift(T_world_cam: Float[np.ndarray, "n 4 4"], T_world_true: Float[np.ndarray, "n 4 4"]):
     try:
         rpe = trajectory_error.rpe(T_world_cam, T_world_true)
-    except DataError:  # no two frames in a row have a truth
+    except DataError:  # no two frames in a row have a ground truth
         return None
     return {
         "delta_frames": 1,

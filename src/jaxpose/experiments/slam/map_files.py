@@ -20,7 +20,7 @@ from jaxpose.geometry import se3
 from jaxpose.geometry.camera import Camera, pixel_direction
 from jaxpose.plots.slam import View
 from jaxpose.scenes import GridConfig, SceneField
-from jaxpose.slam.map.texture import Paint
+from jaxpose.slam.map.texture import Texture
 from jaxpose.slam.observation import Pixels, SampleConfig, render_pixels
 from jaxpose.slam.pipeline import SlamResult
 
@@ -62,7 +62,7 @@ class SavedMap(NamedTuple):
 
     grid: GridConfig
     values: Float[np.ndarray, "x y z 4"]  # of the finest level: signed distance [m], red, green, blue
-    paint: Paint  # finer colour on the surface
+    make_texture: Texture  # finer colour on the surface
     keyframes: Int[np.ndarray, " k"]  # frames, counted from the first of the trajectory
 
 
@@ -169,7 +169,7 @@ def every(camera: Camera, width: int) -> Int[np.ndarray, "h w 2"]:
 def write_map(path: Path | str, saved: SavedMap) -> None:
     """Write a map (npz, compressed): version, the fields of its `GridConfig`, values, paint, keyframes."""
     arrays = asdict(saved.grid) | {"values": saved.values, "keyframes": saved.keyframes}
-    arrays |= {f"paint_{name}": array for name, array in saved.paint._asdict().items()}
+    arrays |= {f"paint_{name}": array for name, array in saved.make_texture._asdict().items()}
     with atomic.atomic(path) as temporary:
         np.savez_compressed(temporary, allow_pickle=False, version=_VERSION, **arrays)
 
@@ -184,8 +184,8 @@ def read_map(path: Path | str) -> SavedMap:
         lower, upper = (tuple(content[name].tolist()) for name in ("lower", "upper"))
         voxel, truncation = float(content["voxel"]), float(content["truncation"])
         config = GridConfig(lower, upper, voxel, int(content["levels"]), truncation)
-        coat = Paint(content["paint_slot"], content["paint_tiles"])
-        return SavedMap(config, content["values"], coat, content["keyframes"])
+        texture = Texture(content["paint_slot"], content["paint_tiles"])
+        return SavedMap(config, content["values"], texture, content["keyframes"])
     except (zipfile.BadZipFile, ValueError, KeyError, EOFError) as error:
         raise DataError(f"{path}: expected a map, got {' '.join(str(error).split())}") from None
 

@@ -36,7 +36,7 @@ class Options:
 
     data: Path | None = None  # folder of a recording; without one a synthetic room is made on the fly
     format: rgbd_registry.Format | Literal["room"] | None = None  # None: found by the files of --data
-    recorded_hz: float = 30.0  # frame rate of a recording whose layout has no time stamps
+    recorded_hz: float = 30.0  # frame rate of a recording whose layout has no timestamps
     rate_hz: float | None = None  # frames are thinned to this; None: the room's, or all frames
     start: int = 0  # first frame used, counted before thinning
     frames: int | None = None  # how many frames from there, counted before thinning; None: all
@@ -46,12 +46,12 @@ class Options:
     imu_file: Path | None = None
     # and where its camera sits on it, T_body_cam: T_BS of a sensor.yaml, or 16 numbers.
     imu_extrinsics: Path | None = None
-    imu_offset_s: float = 0.0  # added to the stamps of a recording's own IMU [s]
+    imu_offset_s: float = 0.0  # added to the timestamps of a recording's own IMU [s]
     imu_filter: bool = False  # take off that IMU's biases with the help of the true poses, as the paper does
     compare: bool = False  # run all IMU modes and put them side by side
     resume: bool = False  # go on where a run of the same folder and settings was stopped
     smoke: bool = False  # everything shrunk to seconds; the numbers then mean nothing
-    out: Path | None = None  # exactly this folder; None: outputs/<experiment>/<name or time stamp>
+    out: Path | None = None  # exactly this folder; None: outputs/<experiment>/<name or timestamp>
     name: str | None = None  # of the run folder
     slam: Annotated[SlamConfig, tyro.conf.arg(name="")] = SlamConfig()
     room: RoomConfig = RoomConfig()
@@ -88,7 +88,7 @@ class Options:
         _room_config(self)
 
 
-def decisive(options: Options) -> dict[str, Any]:
+def resume_fingerprint(options: Options) -> dict[str, Any]:
     """The settings that a resumed run must share with the one it resumes, by the names of the options."""
     return {
         name: value
@@ -124,8 +124,8 @@ class Source(NamedTuple):
 def load(options: Options) -> Source:
     """The recording that the options name: loaded or made, given an IMU if one is needed, cut and thinned.
 
-    An IMU is simulated from the truth before frames are thinned, unless the recording has its own. Time
-    starts at the first frame used. Raises DataError or OSError for what cannot be used.
+    An IMU is simulated from the ground truth before frames are thinned, unless the recording has its own.
+    Time starts at the first frame used. Raises DataError or OSError for what cannot be used.
     """
     if options.data is None:
         name, recording, own_imu = "room", room(_room_config(options)), options.room.along is not None
@@ -140,8 +140,9 @@ def load(options: Options) -> Source:
         if not own_imu and (options.compare or options.slam.imu != "none"):
             recording = recording._replace(imu=_simulated(recording, options))
             imu = (
-                f"simulated at {SIMULATED_HZ:g} Hz from the truth before thinning (cubic spline positions, "
-                f"{options.imu_rotation} rotations, gravity along -z of the truth's frame), "
+                f"simulated at {SIMULATED_HZ:g} Hz from ground truth before thinning (cubic spline "
+                f"positions, "
+                f"{options.imu_rotation} rotations, gravity along -z of the ground truth's frame), "
                 f"{_sheet(options.slam.imu_noise)}, seed {options.slam.seed}"
             )
     if own_imu:
@@ -204,12 +205,12 @@ def _unbiased(recording: Recording, imu: Imu, options: Options) -> Imu:
     """Readings less their biases by the error-state filter on the true poses (paper section 4.3)."""
     if recording.T_world_cam is None:
         raise DataError(f"{recording.name}: --imu-filter expected true poses, got none")
-    truth = recording.T_world_cam @ np.linalg.inv(recording.T_body_cam)
+    ground_truth = recording.T_world_cam @ np.linalg.inv(recording.T_body_cam)
     with jax.enable_x64(True):
         found = filter_imu(
             imu,
             recording.t,
-            truth,
+            ground_truth,
             options.slam.imu_noise,
             _POSE_NOISE,
             gravity_world=tuple(recording.gravity_world.tolist()),
@@ -224,8 +225,8 @@ def _unbiased(recording: Recording, imu: Imu, options: Options) -> Imu:
 
 def _simulated(recording: Recording, options: Options) -> Imu:
     """Readings of an IMU at the camera, from the true poses."""
-    truth = recording.T_world_cam
-    if truth is None or np.isfinite(truth).all(axis=(1, 2)).sum() < FEWEST_FRAMES:
+    ground_truth = recording.T_world_cam
+    if ground_truth is None or np.isfinite(ground_truth).all(axis=(1, 2)).sum() < FEWEST_FRAMES:
         mode = "--compare" if options.compare else f"--imu {options.slam.imu}"
         raise DataError(
             f"{recording.name}: {mode} expected true poses to simulate an IMU from, got none; "
@@ -233,7 +234,7 @@ def _simulated(recording: Recording, options: Options) -> Imu:
         )
     return simulate_from_poses(
         recording.t,
-        truth @ np.linalg.inv(recording.T_body_cam),
+        ground_truth @ np.linalg.inv(recording.T_body_cam),
         SIMULATED_HZ,
         rotation=options.imu_rotation,
         noise=options.slam.imu_noise,
@@ -244,10 +245,10 @@ def _simulated(recording: Recording, options: Options) -> Imu:
 
 def _check_gravity(recording: Recording, options: Options) -> None:
     """Refuse real readings where nothing says which way is down: no true pose, and no gravity in them."""
-    truth = recording.T_world_cam
+    ground_truth = recording.T_world_cam
     if options.slam.imu == "none" and not options.compare:
         return
-    if truth is not None and np.isfinite(truth[0]).all():
+    if ground_truth is not None and np.isfinite(ground_truth[0]).all():
         return
     force, gravity = first_force(recording), np.linalg.norm(recording.gravity_world)
     if force is None or not is_gravity(force, recording.gravity_world):
@@ -282,19 +283,19 @@ def _cut(recording: Recording, options: Options) -> Recording:
             f"{recording.name}: expected at least {FEWEST_FRAMES} frames to track, got {len(recording.t)} "
             f"from frame {options.start} at {options.rate_hz or options.recorded_hz:g} Hz"
         )
-    first, imu, truth = recording.t[0], recording.imu, recording.T_world_cam
+    first, imu, ground_truth = recording.t[0], recording.imu, recording.T_world_cam
     accelerometer = recording.accelerometer
     notes = recording.notes
-    if truth is not None and np.isfinite(truth).all(axis=(1, 2)).sum() < FEWEST_FRAMES:
-        truth, notes = (
+    if ground_truth is not None and np.isfinite(ground_truth).all(axis=(1, 2)).sum() < FEWEST_FRAMES:
+        ground_truth, notes = (
             None,
-            (*notes, "too few true poses among the frames used: there is no truth to compare with"),
+            (*notes, "too few true poses among the frames used: there is no ground truth to compare with"),
         )
     return recording._replace(
         t=recording.t - first,
         imu=None if imu is None else imu._replace(t=np.asarray(imu.t) - first),
         accelerometer=None if accelerometer is None else accelerometer._replace(t=accelerometer.t - first),
         t0=recording.t0 + float(first),
-        T_world_cam=truth,
+        T_world_cam=ground_truth,
         notes=notes,
     )

@@ -18,10 +18,10 @@ from jaxpose.datasets.types import Recording
 from jaxpose.errors import DataError
 from jaxpose.evaluation import trajectory_error
 from jaxpose.experiments import command
-from jaxpose.experiments.slam.callbacks import keeper
+from jaxpose.experiments.slam.callbacks import checkpoint_callback
 from jaxpose.experiments.slam.evaluation import Measured, accuracy, cost, freedom, inertial
 from jaxpose.experiments.slam.map_files import Renderer, SavedMap, map_quality, renderer, views, write_map
-from jaxpose.experiments.slam.options import Options, Source, decisive, load, slam_config
+from jaxpose.experiments.slam.options import Options, Source, load, resume_fingerprint, slam_config
 from jaxpose.experiments.slam.report import table
 from jaxpose.fields import Params, PoseField, bspline
 from jaxpose.fields.serialization import bspline_factor, write_field
@@ -29,9 +29,10 @@ from jaxpose.files import atomic, run_folder, trajectories
 from jaxpose.files.camera_json import write_camera
 from jaxpose.files.ply import write_ply
 from jaxpose.plots import slam as slam_plots
+from jaxpose.slam.checkpoint import load as load_checkpoint
 from jaxpose.slam.initial_pose import first_pose
 from jaxpose.slam.keyframes import read_keyframes
-from jaxpose.slam.map.mesh import cloud, mesh
+from jaxpose.slam.map.mesh import mesh, point_cloud
 from jaxpose.slam.pipeline import ImuMode, Progress, SlamResult
 from jaxpose.slam.pipeline import run as track
 from jaxpose.slam.system import make_system
@@ -112,15 +113,15 @@ def _single(
     """One tracked run, written: its results, and the translation error [m] of every frame."""
     recording, mode = source.recording, options.slam.imu
     checkpoint, finished = folder / "checkpoint.npz", folder / "results.json"
-    if not command.resumes(folder, folder / "settings.json", decisive(options), options.resume):
+    if not command.resumes(folder, folder / "settings.json", resume_fingerprint(options), options.resume):
         checkpoint.unlink(missing_ok=True)
         finished.unlink(missing_ok=True)
     if finished.exists():
         return json.loads(finished.read_text()), _written_errors(folder, recording)
     config, state = slam_config(options), None
     if checkpoint.exists():
-        state = checkpoint.load(checkpoint, make_system(recording, config))
-    keep = keeper(folder, recording, decisive(options))
+        state = load_checkpoint(checkpoint, make_system(recording, config))
+    keep = checkpoint_callback(folder, recording, resume_fingerprint(options))
 
     def done(progress: Progress) -> None:
         keep(progress)
@@ -138,20 +139,20 @@ def _written(
     experiment: str, options: Options, source: Source, folder: Path, result: SlamResult, started: float
 ) -> tuple[dict[str, Any], Float[np.ndarray, " n"]]:
     """A tracked recording measured and written, all but its results; the translation error of every frame."""
-    recording, mode, truth = source.recording, options.slam.imu, source.recording.T_world_cam
-    errors = None if truth is None else accuracy(result, recording.t, truth)
+    recording, mode, ground_truth = source.recording, options.slam.imu, source.recording.T_world_cam
+    errors = None if ground_truth is None else accuracy(result, recording.t, ground_truth)
     measured = Measured(errors, inertial(recording, result), freedom(recording, result))
     render = renderer(recording, result)
     _draw(folder, f"{recording.name}, IMU {mode}", recording, result, render, measured)
     trajectories.write_tum(
         folder / "trajectory.txt", trajectories.Trajectory(recording.t, result.T_world_cam)
     )
-    if truth is not None:
-        trajectories.write_tum(folder / "reference.txt", trajectories.Trajectory(recording.t, truth))
+    if ground_truth is not None:
+        trajectories.write_tum(folder / "reference.txt", trajectories.Trajectory(recording.t, ground_truth))
     span = (0.0, float(recording.t[-1] - recording.t[0]))
     write_field(folder / "field.npz", span, [bspline_factor(span, result.field_params)])
-    values, coat = jax.tree.map(np.asarray, result.scene_params)
-    write_map(folder / "map.npz", SavedMap(result.grid, values, coat, result.keyframes))
+    values, texture = jax.tree.map(np.asarray, result.scene_params)
+    write_map(folder / "map.npz", SavedMap(result.grid, values, texture, result.keyframes))
     images_folder = "." if options.data is None else options.data.resolve()
     notes = (*recording.notes, *first_pose(recording).notes, *_write_surface(folder, recording, result))
     write_camera(folder / "camera.json", recording.camera, recording.files, images_folder)
@@ -186,7 +187,7 @@ def _written_errors(folder: Path, recording: Recording) -> Float[np.ndarray, " n
 def _write_surface(folder: Path, recording: Recording, result: SlamResult) -> tuple[str, ...]:
     """The map as a point cloud and, where scikit-image is installed, as a mesh; a note where it is not."""
     keyframes = partial(read_keyframes, recording, result.keyframes, result.T_world_cam)
-    points = cloud(keyframes(), recording.camera, result.grid.voxel)
+    points = point_cloud(keyframes(), recording.camera, result.grid.voxel)
     write_ply(folder / "points.ply", points.points, points.rgb)
     try:
         values, _ = result.scene_params
@@ -209,7 +210,7 @@ def _draw(
     errors, motion, freed = measured
     name = f"{name}, {len(recording.t)} frames"
     if errors is None:
-        title = f"{name}: no truth to compare with"
+        title = f"{name}: no ground truth to compare with"
         slam_plots.trajectory(folder / "trajectory.png", result.T_world_cam, None, result.lost, title)
     else:
         ate = f"{name}: ATE-RMSE {100 * errors.numbers['ate_rmse_m']:.2f} cm after SE(3) alignment"

@@ -71,7 +71,7 @@ def report(folder: Path, results: dict[str, Any]) -> str:
     if "ate_rmse_m" in results:
         lines += _against_truth(results)
     else:
-        lines.append(_line("ATE", "no truth to compare with"))
+        lines.append(_line("ATE", "no ground truth to compare with"))
     lines += [
         _line(
             "lost",

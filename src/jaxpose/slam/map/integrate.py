@@ -7,7 +7,7 @@ that views from different sides agree about it.
 
 The scene's distance is cut off close behind surfaces, as thin things have two sides. Beside it the map has a
 second one that reaches farther to both sides, and keeps where anything was measured: by that one a
-camera is aligned from farther off (`look_up`).
+camera is aligned from farther off (`sample_map`).
 """
 
 from collections.abc import Callable
@@ -24,7 +24,7 @@ from jaxpose.geometry.camera import Camera, pixel_direction
 from jaxpose.scenes import GridConfig, SceneField, node_shape
 from jaxpose.scenes.types import Params
 from jaxpose.scenes.voxel_grid import trilinear
-from jaxpose.slam.map.normals import GRAZING, Seen, seen_by
+from jaxpose.slam.map.normals import GRAZING, SurfaceObservation, seen_by
 from jaxpose.slam.map.photometric import MapState
 from jaxpose.slam.observation import Image, locate
 
@@ -35,12 +35,12 @@ _TILE = 8  # nodes along each side of what is updated, or skipped, in one go
 _CUT = 0.98  # of a distance's reach: what is nearer to its end was cut off
 
 
-class Nearby(NamedTuple):
+class MapSample(NamedTuple):
     """What a map says about a point: signed distance [m] to the surface, colour there, 1 where it knows."""
 
     distance: Float[Array, ""]
     rgb: Float[Array, "3"]
-    known: Float[Array, ""]
+    valid: Float[Array, ""]
 
 
 class _Reach(NamedTuple):
@@ -51,10 +51,10 @@ class _Reach(NamedTuple):
     wide: float
 
 
-Lookup = Callable[[Float[Array, "3"]], Nearby]
+MapSampler = Callable[[Float[Array, "3"]], MapSample]
 
 
-def make_fuse(config: GridConfig, camera: Camera, band: float):
+def make_integrate(config: GridConfig, camera: Camera, band: float):
     """`init(params)` and the compiled step `update(state, image, T_world_cam)` of closed-form mapping.
 
     `band` [m] is how far behind a surface a distance of the scene still counts as measured. The memory
@@ -82,50 +82,50 @@ def make_fuse(config: GridConfig, camera: Camera, band: float):
             index = jnp.stack(jnp.meshgrid(*index, indexing="ij"), axis=-1)
             own = jnp.all(index >= order[n].reshape(1, 1, 1, 3), axis=-1)
             points = jnp.asarray(lower).reshape(1, 1, 1, 3) + config.voxel * index.astype(jnp.float32)
-            values, memory = (jax.lax.dynamic_slice(m, (*first, 0), (*tile, m.shape[3])) for m in maps)
+            values, fusion_state = (jax.lax.dynamic_slice(m, (*first, 0), (*tile, m.shape[3])) for m in maps)
             points_cam = se3.apply(T_cam_world, points)
             seen = seen_at(locate(camera, points_cam))
-            seen = seen._replace(worth=jnp.where(own, seen.worth, 0))
-            parts = _fused(values, memory, points_cam, seen, reach)
+            seen = seen._replace(weight=jnp.where(own, seen.weight, 0))
+            parts = _integrated(values, fusion_state, points_cam, seen, reach)
             return tuple(
                 jax.lax.dynamic_update_slice(m, part, (*first, 0))
                 for m, part in zip(maps, parts, strict=True)
             )
 
         # One tile after the other, in place: what is in between stays small, whatever the map's size.
-        maps = jax.lax.fori_loop(0, jnp.sum(in_sight), fuse_tile, (state.params[0], state.memory))
+        maps = jax.lax.fori_loop(0, jnp.sum(in_sight), fuse_tile, (state.params[0], state.fusion_state))
         return MapState(maps[:1], maps[1])
 
     return lambda params: MapState(params, jnp.zeros((*params[0].shape[:3], 5))), update
 
 
-def _fused(
+def _integrated(
     values: Float[Array, "*n 4"],
-    memory: Float[Array, "*n 5"],
+    fusion_state: Float[Array, "*n 5"],
     points_cam: Float[Array, "*n 3"],
-    seen: Seen,
+    seen: SurfaceObservation,
     reach: _Reach,
 ) -> tuple[Float[Array, "*n 4"], Float[Array, "*n 5"]]:
     """Nodes at points in camera axes with what an image says of them added."""
     distance, depth = seen.distance(points_cam), points_cam[..., 2]
     # How far behind a surface a node is goes by the optical axis, as little is known there at a grazing
     # angle; but the nodes next to it are needed on both sides.
-    along = distance * depth / jnp.maximum(seen.facing(points_cam), GRAZING * depth)
+    along = distance * depth / jnp.maximum(seen.incidence_cosine(points_cam), GRAZING * depth)
     along = jnp.where(jnp.abs(distance) < reach.beside, distance, along)
     gain = jnp.stack([
-        jnp.where(along > -reach.band, seen.worth, 0),
-        jnp.where(jnp.abs(along) < reach.band, seen.worth, 0),
-        jnp.where(along > -reach.wide, seen.worth, 0),
+        jnp.where(along > -reach.band, seen.weight, 0),
+        jnp.where(jnp.abs(along) < reach.band, seen.weight, 0),
+        jnp.where(along > -reach.wide, seen.weight, 0),
     ], axis=-1)  # fmt: skip
-    weight, wide, known = memory[..., :3], memory[..., 3], memory[..., 4]
+    weight, wide, valid = fusion_state[..., :3], fusion_state[..., 3], fusion_state[..., 4]
     total = weight + gain
     share = gain / jnp.where(total > 0, total, 1)
     found = jnp.concatenate([jnp.minimum(distance, reach.band)[..., None], seen.rgb], axis=-1)
     values = values + share[..., jnp.array([0, 1, 1, 1])] * (found - values)
     wide = wide + share[..., 2] * (jnp.minimum(distance, reach.wide) - wide)
-    known = jnp.where(gain[..., 2] > 0, 1, known)
-    memory = jnp.concatenate([jnp.minimum(total, _MEMORY), wide[..., None], known[..., None]], axis=-1)
-    return values, memory
+    valid = jnp.where(gain[..., 2] > 0, 1, valid)
+    fusion_state = jnp.concatenate([jnp.minimum(total, _MEMORY), wide[..., None], valid[..., None]], axis=-1)
+    return values, fusion_state
 
 
 def _cone(camera: Camera) -> Callable[[Float[Array, "m 8 3"], Float[Array, ""]], Bool[Array, " m"]]:
@@ -142,9 +142,14 @@ def _cone(camera: Camera) -> Callable[[Float[Array, "m 8 3"], Float[Array, ""]],
     return in_view
 
 
-def look_up(
-    scene: SceneField, config: GridConfig, wide: bool, params: Params, memory: Any, point: Float[Array, "3"]
-) -> Nearby:
+def sample_map(
+    scene: SceneField,
+    config: GridConfig,
+    wide: bool,
+    params: Params,
+    fusion_state: Any,
+    point: Float[Array, "3"],
+) -> MapSample:
     """A point in a map: by the scene's distance and, away from surfaces, by the wide one of a fused map.
 
     Near a surface the scene's own is the truer one: the wide one mixes what is on both sides of thin things.
@@ -152,9 +157,9 @@ def look_up(
     """
     distance, rgb = scene.query(params, point, jnp.zeros(3, point.dtype))
     if not wide:
-        return Nearby(distance, rgb, (jnp.abs(distance) < _CUT * config.truncation).astype(distance.dtype))
-    *_, far, known = trilinear(memory, (point - jnp.asarray(config.lower, point.dtype)) / config.voxel)
-    measured = (known > 1 - 1e-3) & (jnp.abs(far) < _CUT * _REACH * config.voxel)
+        return MapSample(distance, rgb, (jnp.abs(distance) < _CUT * config.truncation).astype(distance.dtype))
+    *_, far, valid = trilinear(fusion_state, (point - jnp.asarray(config.lower, point.dtype)) / config.voxel)
+    measured = (valid > 1 - 1e-3) & (jnp.abs(far) < _CUT * _REACH * config.voxel)
     whole = jnp.abs(distance) < config.truncation - _BESIDE * config.voxel
     whole &= jnp.abs(far) < config.truncation - config.voxel
-    return Nearby(jnp.where(whole, distance, far), rgb, measured.astype(distance.dtype))
+    return MapSample(jnp.where(whole, distance, far), rgb, measured.astype(distance.dtype))

@@ -27,7 +27,7 @@ class Surface(NamedTuple):
     faces: Int[np.ndarray, "m 3"]
 
 
-def cloud(keyframes: Iterable[Keyframe], camera: Camera, voxel: float) -> Surface:
+def point_cloud(keyframes: Iterable[Keyframe], camera: Camera, voxel: float) -> Surface:
     """Measured points of the keyframes, one (the first that came) in each cube of `voxel` [m]."""
     row, column = (jnp.asarray(x.ravel()) for x in np.mgrid[: camera.height, : camera.width])
 

@@ -15,7 +15,7 @@ _SAME_SURFACE = 3.0  # sigmas of depth that the middle between two pixels may be
 GRAZING = 0.1  # cosine of incidence below which a plane says nothing
 
 
-class Seen(NamedTuple):
+class SurfaceObservation(NamedTuple):
     """What pixels say: the plane n . x + d = 0 [m] in camera axes, its worth (0: no depth), its colour.
 
     Worth is the inverse variance of the depth against that at a metre, times the cosine of incidence.
@@ -23,30 +23,32 @@ class Seen(NamedTuple):
 
     normal: Float[Array, "*n 3"]
     offset: Float[Array, "*n"]
-    worth: Float[Array, "*n"]
+    weight: Float[Array, "*n"]
     rgb: Float[Array, "*n 3"]  # as bright as the map's
 
     def distance(self, point_cam: Float[Array, "*n 3"]) -> Float[Array, "*n"]:
         """Signed distance [m] of points in camera axes to the planes, positive in front of them."""
         return jnp.sum(self.normal * point_cam, axis=-1) + self.offset
 
-    def facing(self, point_cam: Float[Array, "*n 3"]) -> Float[Array, "*n"]:
+    def incidence_cosine(self, point_cam: Float[Array, "*n 3"]) -> Float[Array, "*n"]:
         """How far [m] the points are from the camera along the planes' normals."""
         return -jnp.sum(self.normal * point_cam, axis=-1)
 
 
-def seen_by(image: Image, camera: Camera) -> Callable[[Located], Seen]:
+def seen_by(image: Image, camera: Camera) -> Callable[[Located], SurfaceObservation]:
     """What an image says at located points, ready to be asked: one row is read for each."""
     planes = tangent_planes(image.depth, camera)
     cosine = _cosine(planes[..., :3], _directions(camera))
     near = (depth_sigma(jnp.ones(())) / depth_sigma(image.depth)) ** 2
-    worth = jnp.where(image.depth > 0, near * jnp.maximum(cosine, GRAZING), 0)
+    weight = jnp.where(image.depth > 0, near * jnp.maximum(cosine, GRAZING), 0)
     rgb = image.rgb.astype(planes.dtype) / 255 * image.exposure[None, None]
-    rows = jnp.concatenate([planes, worth[..., None], rgb], axis=-1)
+    rows = jnp.concatenate([planes, weight[..., None], rgb], axis=-1)
 
-    def at(located: Located) -> Seen:
+    def at(located: Located) -> SurfaceObservation:
         row = rows[located.row, located.column]
-        return Seen(row[..., :3], row[..., 3], jnp.where(located.inside, row[..., 4], 0), row[..., 5:])
+        return SurfaceObservation(
+            row[..., :3], row[..., 3], jnp.where(located.inside, row[..., 4], 0), row[..., 5:]
+        )
 
     return at
 

@@ -39,7 +39,7 @@ class MapState(NamedTuple):
     """The scene, and what the method remembers: Adam's moments, or the weight of each node."""
 
     params: Params
-    memory: Any
+    fusion_state: Any
 
 
 def make_descend(scene: SceneField, camera: Camera, config: MapConfig):
@@ -73,8 +73,8 @@ def make_descend(scene: SceneField, camera: Camera, config: MapConfig):
         target = jnp.clip(depth - depths, -band, band)
         supervised = (depths <= depth + band).astype(distance.dtype)
         # Near depth is worth more than far depth.
-        worth = (depth_sigma(jnp.ones(())) / depth_sigma(depth)) ** 2
-        loss = worth * jnp.sum(supervised * (distance - target) ** 2) + jnp.sum((seen.rgb - rgb) ** 2)
+        weight = (depth_sigma(jnp.ones(())) / depth_sigma(depth)) ** 2
+        loss = weight * jnp.sum(supervised * (distance - target) ** 2) + jnp.sum((seen.rgb - rgb) ** 2)
         return loss, (depth > 0).astype(loss.dtype)
 
     @partial(jax.jit, donate_argnums=0)

@@ -27,7 +27,7 @@ _PAINTED = 0.25  # weight of painted nodes around a point from which on they giv
 _TILE = 16  # cells of paint along each side of what is kept, or empty, as one
 
 
-class Paint(NamedTuple):
+class Texture(NamedTuple):
     """Red, green, blue and 255 (0: none) at nodes near a surface, in tiles that share their outer nodes.
 
     `slot` says where in `tiles` a tile of space is; tile 0 is the empty one.
@@ -37,9 +37,9 @@ class Paint(NamedTuple):
     tiles: UInt8[Any, "n 17 17 17 4"]
 
 
-def paint(
+def make_texture(
     grid: GridConfig, distance: Float[np.ndarray, "x y z"], keyframes: Iterable[Keyframe], camera: Camera
-) -> Paint:
+) -> Texture:
     """The surface of a map painted from keyframes, at nodes `_FINER` times as dense as the map's.
 
     `distance` [m] is the map's signed distance. A node's colour is the mean over the keyframes that measured
@@ -54,8 +54,8 @@ def paint(
         points_cam = se3.apply(se3.inverse(T_world_cam), points)
         at = locate(camera, points_cam)
         seen = seen_by(image, camera)(at)
-        same = (seen.worth > 0) & (jnp.abs(seen.distance(points_cam)) < near)
-        filled = jnp.maximum(seen.facing(points_cam), 0) / jnp.maximum(at.depth, 0.1) ** 3
+        same = (seen.weight > 0) & (jnp.abs(seen.distance(points_cam)) < near)
+        filled = jnp.maximum(seen.incidence_cosine(points_cam), 0) / jnp.maximum(at.depth, 0.1) ** 3
         weight = jnp.where(same, filled, 0)[:, None]
         return total + weight * jnp.concatenate([seen.rgb, jnp.ones_like(weight)], axis=-1)
 
@@ -65,23 +65,23 @@ def paint(
     rgb, weight = np.split(np.asarray(total), [3], axis=-1)
     there = weight[:, 0] > 0
     colour = np.round(255 * rgb[there] / weight[there])
-    coat = np.concatenate([colour, np.full((len(colour), 1), 255)], axis=1).astype(np.uint8)
-    return _tiled(nodes[there], coat, _FINER * (np.array(distance.shape) - 1))
+    texture = np.concatenate([colour, np.full((len(colour), 1), 255)], axis=1).astype(np.uint8)
+    return _tiled(nodes[there], texture, _FINER * (np.array(distance.shape) - 1))
 
 
-def painted(scene: SceneField, grid: GridConfig) -> SceneField:
+def textured(scene: SceneField, grid: GridConfig) -> SceneField:
     """A map's scene with its paint: parameters (values, paint); the map's own colour where there is none."""
 
     def query(params, point, direction):
-        *values, coat = params
+        *values, texture = params
         distance, rgb = scene.query(tuple(values), point, direction)
         position = (point - jnp.asarray(grid.lower, point.dtype)) * (_FINER / grid.voxel)
-        tile = jnp.clip(position / _TILE, 0, jnp.array(coat.slot.shape, point.dtype) - 1).astype(jnp.int32)
+        tile = jnp.clip(position / _TILE, 0, jnp.array(texture.slot.shape, point.dtype) - 1).astype(jnp.int32)
         within = position - _TILE * tile.astype(point.dtype)
         # All tiles one behind the other: a position within its own reads no other.
-        row = coat.slot[tuple(tile)] * (_TILE + 1)
+        row = texture.slot[tuple(tile)] * (_TILE + 1)
         behind = jnp.array([1, 0, 0], point.dtype) * row.astype(point.dtype)
-        tiles = coat.tiles.reshape(-1, *coat.tiles.shape[2:])
+        tiles = texture.tiles.reshape(-1, *texture.tiles.shape[2:])
         colour, alpha = jnp.split(trilinear(tiles, jnp.clip(within, 0, _TILE) + behind) / 255, [3])
         return distance, jnp.where(alpha > _PAINTED, colour / jnp.maximum(alpha, _PAINTED), rgb)
 
@@ -89,8 +89,8 @@ def painted(scene: SceneField, grid: GridConfig) -> SceneField:
 
 
 def _tiled(
-    nodes: Int[np.ndarray, "m 3"], coat: UInt8[np.ndarray, "m 4"], cells: Int[np.ndarray, "3"]
-) -> Paint:
+    nodes: Int[np.ndarray, "m 3"], texture: UInt8[np.ndarray, "m 4"], cells: Int[np.ndarray, "3"]
+) -> Texture:
     """Painted nodes in tiles; a node on the side of a tile is in its neighbour too."""
     count = -(-cells // _TILE)
     where, within, which = [], [], []
@@ -105,8 +105,8 @@ def _tiled(
     slot = np.zeros(int(np.prod(count)), np.int32)
     slot[used] = np.arange(1, len(used) + 1)
     tiles = np.zeros((len(used) + 1, *(_TILE + 1,) * 3, 4), np.uint8)
-    tiles[(place + 1, *np.concatenate(within).T)] = coat[np.concatenate(which)]
-    return Paint(slot.reshape(count), tiles)
+    tiles[(place + 1, *np.concatenate(within).T)] = texture[np.concatenate(which)]
+    return Texture(slot.reshape(count), tiles)
 
 
 def _coat(grid: GridConfig, distance: Float[np.ndarray, "x y z"]) -> Int[np.ndarray, "m 3"]:

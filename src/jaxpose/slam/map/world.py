@@ -11,15 +11,15 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxpose.datasets.types import Frame, Recording
-from jaxpose.scenes import GridConfig, SceneField, box, grid, grow, merge
+from jaxpose.scenes import GridConfig, SceneField, bounding_grid, grid, grow, merge
 from jaxpose.scenes.types import Params
 from jaxpose.slam.config import SlamConfig
 from jaxpose.slam.keyframes import choose, overlap, read_keyframes
-from jaxpose.slam.map.integrate import look_up, make_fuse
+from jaxpose.slam.map.integrate import make_integrate, sample_map
 from jaxpose.slam.map.photometric import MapState, make_descend
 from jaxpose.slam.observation import Image, sample_pixels
-from jaxpose.slam.tracking.relocalise import search as find
-from jaxpose.slam.tracking.steps import Settle, Tracked, make_track
+from jaxpose.slam.tracking.relocalise import relocalise as find
+from jaxpose.slam.tracking.steps import FieldUpdate, Tracked, make_track
 from jaxpose.slam.types import SlamState
 
 _LOOKED_AT = 400  # pixels of a search
@@ -30,32 +30,34 @@ class World(NamedTuple):
 
     scene: SceneField
     start: Callable[[], MapState]
-    search: Callable[..., Float[Array, "4 4"]]
+    relocalise: Callable[..., Float[Array, "4 4"]]
     track: Callable[..., Tracked]
     update: Callable[..., MapState]
 
 
-def make_world(recording: Recording, config: SlamConfig, settle: Settle, size: GridConfig) -> World:
+def make_world(
+    recording: Recording, config: SlamConfig, field_update: FieldUpdate, size: GridConfig
+) -> World:
     """The map's compiled steps for a grid."""
     scene = grid(size)
     scale = {"band": size.truncation, "width": size.truncation / 8}
     if config.map.method == "fused":
-        init_map, update = make_fuse(size, recording.camera, size.truncation)
+        init_map, update = make_integrate(size, recording.camera, size.truncation)
     else:
         map_config = replace(config.map, sample=replace(config.map.sample, **scale))
         init_map, update = make_descend(scene, recording.camera, map_config)
     track_config = replace(config.track, sample=replace(config.track.sample, **scale))
     T_body_cam = jnp.asarray(recording.T_body_cam, jnp.float32)
-    look = partial(look_up, scene, size, config.map.method == "fused")
-    track = make_track(scene, look, recording.camera, T_body_cam, track_config, settle)
+    look = partial(sample_map, scene, size, config.map.method == "fused")
+    track = make_track(scene, look, recording.camera, T_body_cam, track_config, field_update)
 
     @jax.jit
-    def search(scene_params, memory, T_world_cam, sigma, image, key):
+    def relocalise(scene_params, fusion_state, T_world_cam, sigma, image, key):
         pixel_key, key = jax.random.split(key)
         pixels = sample_pixels(pixel_key, image, recording.camera, _LOOKED_AT, edge=config.track.edge)
-        return find(partial(look, scene_params, memory), T_world_cam, sigma, pixels, key)
+        return find(partial(look, scene_params, fusion_state), T_world_cam, sigma, pixels, key)
 
-    return World(scene, lambda: init_map(scene.init(jax.random.key(0))), search, track, update)
+    return World(scene, lambda: init_map(scene.init(jax.random.key(0))), relocalise, track, update)
 
 
 def scene_params(state: MapState) -> Params:
@@ -79,13 +81,13 @@ def seen_points(
     return points @ T_world_cam[:3, :3].T + T_world_cam[:3, 3]
 
 
-def first_grid(points: Float[np.ndarray, "n 3"], config: SlamConfig) -> GridConfig:
+def initial_grid(points: Float[np.ndarray, "n 3"], config: SlamConfig) -> GridConfig:
     """A grid for what the first frame sees."""
     levels = 1 if config.map.method == "fused" else 2
-    return box(_bounds(points), voxel=config.voxel, levels=levels)
+    return bounding_grid(_bounds(points), voxel=config.voxel, levels=levels)
 
 
-def room_for(points: Float[np.ndarray, "n 3"], state: SlamState) -> SlamState:
+def grow_to_fit(points: Float[np.ndarray, "n 3"], state: SlamState) -> SlamState:
     """The state with a grid that holds the points; a few stray ones do not make it grow."""
     lower, upper = corners = _bounds(points)
     if (lower >= state.grid.lower).all() and (upper <= state.grid.upper).all():

@@ -13,7 +13,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float
 
-from jaxpose.fields import Params, PoseField, pin
+from jaxpose.fields import Params, PoseField, project_onto_poses
 from jaxpose.fields.intrinsic_motion import dof_loss, outer_loss
 from jaxpose.geometry import se3
 
@@ -55,12 +55,15 @@ def make_refit(outer: PoseField, inner: PoseField, angle_of_view: float) -> Refi
         T_outer = jax.vmap(partial(outer.pose, found))(t)
         T_inner = se3.compose(se3.inverse(T_outer), T)
         recent = lambda p: jax.vmap(partial(inner.pose, p))(t[-_RECENT:])
-        return {"outer": found, "inner": pin(recent, params["inner"], T_inner[-_RECENT:])}, T_inner
+        return {
+            "outer": found,
+            "inner": project_onto_poses(recent, params["inner"], T_inner[-_RECENT:]),
+        }, T_inner
 
     return refit
 
 
-def due(i: int, count: int) -> bool:
+def is_due(i: int, count: int) -> bool:
     """Whether the intrinsic frame is brought to the motions so far after frame `i` of `count`."""
     return i > 0 and (i % EVERY == 0 or i == count - 1)
 

@@ -13,7 +13,7 @@ from jaxpose.imu import ResidualSigmas
 from jaxpose.losses import weighted_mean
 from jaxpose.render import Query
 from jaxpose.slam.observation import Pixels, SampleConfig, depth_sigma, render_pixels
-from jaxpose.slam.tracking.predict import Interval
+from jaxpose.slam.tracking.predict import TrackingProblem
 
 _LEAST_SPREAD = 0.01  # of colours in [0, 1]
 
@@ -103,7 +103,7 @@ def image_loss(residuals: Residuals, config: TrackConfig) -> Float[Array, ""]:
 
 
 def imu_loss(
-    motion: PoseFn, interval: Interval, weights: ImuWeights, sigmas: ResidualSigmas
+    motion: PoseFn, interval: TrackingProblem, weights: ImuWeights, sigmas: ResidualSigmas
 ) -> Float[Array, ""]:
     """The weighted inertial L1 losses, each in its sigmas, means over readings and axes."""
     if not any(weights):

@@ -12,22 +12,24 @@ from jaxpose import imu as inertial
 from jaxpose.geometry import se3
 from jaxpose.imu import Imu
 
-AHEAD = 8  # stamps of a predicted motion
+AHEAD = 8  # timestamps of a predicted motion
 GYRO_BIAS_SIGMA = 0.1  # [rad/s] of a gyroscope of which nothing is known yet
 BEHIND = 3  # frames before the last one that the field keeps to
 
 
-class Interval(NamedTuple):
+class TrackingProblem(NamedTuple):
     """What is known of the motion since the last frame (`ref`) before this frame's image is looked at."""
 
     t: Float[Array, ""]  # [s] of this frame, since the last
-    stamps: Float[Array, " k"]  # [s] of the predicted motion, and of the frames before the last (negative)
+    timestamps: Float[
+        Array, " k"
+    ]  # [s] of the predicted motion, and of the frames before the last (negative)
     T_ref_body: Float[Array, "k 4 4"]
     sigma: Float[Array, "2"]  # [m, rad] how far the prediction for `t` may be off
-    readings: "Readings"
+    readings: "PreintegratedImu"
 
 
-class Readings(NamedTuple):
+class PreintegratedImu(NamedTuple):
     """Inertial readings since the last frame, padded: times [s], what was read, and what follows from it."""
 
     imu: Imu
@@ -52,9 +54,9 @@ def log(T: Float[np.ndarray, "*n 4 4"]) -> Float[np.ndarray, "*n 6"]:
 
 
 @jax.jit
-def integrate(
+def preintegrate(
     imu: Imu, mask: Bool[Array, " s"], R_world_ref: Float[Array, "3 3"], gravity_world: Float[Array, "3"]
-) -> Readings:
+) -> PreintegratedImu:
     """Rotation, velocity and position that an interval's readings add up to, in the frame of its start."""
     R_ref_body = inertial.integrate_gyro(jnp.eye(3), jnp.asarray(imu.t), jnp.asarray(imu.omega_body), mask)
     R_world_body = jnp.matmul(R_world_ref[None], R_ref_body, precision="highest")
@@ -66,41 +68,47 @@ def integrate(
     before = jnp.concatenate([jnp.zeros((1, 3)), velocity[:-1]])
     position = jnp.cumsum((before + mean * dt / 2) * dt, axis=0)
     zero = jnp.zeros((1, 3))
-    return Readings(
+    return PreintegratedImu(
         imu, mask, R_ref_body, acceleration_body,
         jnp.concatenate([zero, velocity]), jnp.concatenate([zero, position]),
     )  # fmt: skip
 
 
-def no_readings() -> Readings:
+def no_imu() -> PreintegratedImu:
     """The readings where there are none: one masked sample."""
     zero = jnp.zeros((1, 3))
     imu = Imu(jnp.zeros(1), zero, zero)
-    return Readings(imu, jnp.zeros(1, bool), jnp.eye(3)[None], zero, zero, zero)
+    return PreintegratedImu(imu, jnp.zeros(1, bool), jnp.eye(3)[None], zero, zero, zero)
 
 
 def predict(
-    t: float, twist: np.ndarray, velocity_ref: np.ndarray, readings: Readings, *, rotation: bool, speed: bool
+    t: float,
+    twist: np.ndarray,
+    velocity_ref: np.ndarray,
+    readings: PreintegratedImu,
+    *,
+    rotation: bool,
+    speed: bool,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Stamps (k,) in (0, t] and the motion `T_ref_body` (k, 4, 4) then.
+    """Timestamps (k,) in (0, t] and the motion `T_ref_body` (k, 4, 4) then.
 
     `twist` is the last frame's motion per second, `velocity_ref` [m/s] how fast the body was at its end. With
     `rotation` the gyroscope turns the body, with `speed` the accelerometer changes its velocity; without, or
     where there are no readings, both stay as they were.
     """
-    stamps = t * np.arange(1, AHEAD + 1) / AHEAD
-    steady = exp(stamps[:, None] * twist)
+    timestamps = t * np.arange(1, AHEAD + 1) / AHEAD
+    steady = exp(timestamps[:, None] * twist)
     count = int(np.sum(np.asarray(readings.mask)))
     if not rotation or count < 2:
-        return stamps, steady
-    nearest = np.searchsorted(np.asarray(readings.imu.t)[:count], stamps - 1e-6).clip(0, count - 1)
-    stamps = np.asarray(readings.imu.t, np.float64)[nearest]
+        return timestamps, steady
+    nearest = np.searchsorted(np.asarray(readings.imu.t)[:count], timestamps - 1e-6).clip(0, count - 1)
+    timestamps = np.asarray(readings.imu.t, np.float64)[nearest]
     poses = np.tile(np.eye(4), (AHEAD, 1, 1))
     poses[:, :3, :3] = np.asarray(readings.R_ref_body)[nearest]
-    poses[:, :3, 3] = stamps[:, None] * velocity_ref
+    poses[:, :3, 3] = timestamps[:, None] * velocity_ref
     if speed:
         poses[:, :3, 3] += np.asarray(readings.position_ref)[nearest]
-    return stamps, poses
+    return timestamps, poses
 
 
 def prediction_sigma(
@@ -121,7 +129,7 @@ def prediction_sigma(
     ])  # fmt: skip
 
 
-def end_velocity(t: float, T_ref_body: np.ndarray, readings: Readings, *, speed: bool) -> np.ndarray:
+def end_velocity(t: float, T_ref_body: np.ndarray, readings: PreintegratedImu, *, speed: bool) -> np.ndarray:
     """Velocity [m/s] of the body, in its axes, at the end of an interval of motion `T_ref_body`.
 
     With `speed`, the mean velocity is carried to the end by the accelerometer.

@@ -1,7 +1,7 @@
 """What the tracked field's output refers to: the paper's table 9, and one of ours, as compositions.
 
 Tracking asks for the body's motion since the last frame, a function of the seconds since then. A frame of
-reference turns a field into that. What changes from frame to frame is a traced `Gauge`, so nothing
+reference turns a field into that. What changes from frame to frame is a traced `ReferenceFrame`, so nothing
 recompiles.
 """
 
@@ -20,17 +20,17 @@ from jaxpose.fields import Params, PoseField, PoseFn, PoseNetConfig, anchored, i
 FrameName = Literal["anchored", "default", "world", "random", "intrinsic"]
 
 
-class Gauge(NamedTuple):
+class ReferenceFrame(NamedTuple):
     """Where the field stands against the last frame: its reference there, and its clock then."""
 
     T_ref_field: Float[Array, "4 4"]
     clock: Float[Array, ""]  # [s]
 
 
-Motion = Callable[[Params, Gauge], PoseFn]
+Motion = Callable[[Params, ReferenceFrame], PoseFn]
 
 
-class Framed(NamedTuple):
+class FramedField(NamedTuple):
     """A field in a frame of reference.
 
     `motion` is the body's since the last frame. `direct` is the same without the anchor: equal to it where
@@ -44,7 +44,7 @@ class Framed(NamedTuple):
     parts: tuple[PoseField, PoseField] | None = None
 
 
-def make_field(name: FrameName, config: PoseNetConfig, interval_s: float, duration_s: float) -> Framed:
+def make_field(name: FrameName, config: PoseNetConfig, interval_s: float, duration_s: float) -> FramedField:
     """The field for a frame of reference of table 9.
 
     `anchored` is ours: P(f(0))^-1 . P(f(t)), the identity at the last frame by construction, on a clock that
@@ -54,19 +54,19 @@ def make_field(name: FrameName, config: PoseNetConfig, interval_s: float, durati
     if name == "anchored":
         field = posenet(replace(config, span=(-4 * interval_s, 4 * interval_s)))
 
-        def motion(params, gauge):
+        def motion(params, reference_frame):
             zero = jnp.zeros(())
-            return anchored(lambda t: field.pose(params, t), zero, gauge.T_ref_field)
+            return anchored(lambda t: field.pose(params, t), zero, reference_frame.T_ref_field)
 
-        return Framed(field, motion, lambda params, gauge: lambda t: field.pose(params, t))
+        return FramedField(field, motion, lambda params, reference_frame: lambda t: field.pose(params, t))
 
     net = posenet(replace(config, span=(0.0, duration_s)))
     field = _held(intrinsic(net, net)) if name == "intrinsic" else net
 
-    def motion_in_frame(params, gauge):
-        return in_frame(lambda t: field.pose(params, t + gauge.clock), gauge.T_ref_field)
+    def motion_in_frame(params, reference_frame):
+        return in_frame(lambda t: field.pose(params, t + reference_frame.clock), reference_frame.T_ref_field)
 
-    return Framed(field, motion_in_frame, motion_in_frame, (net, net) if name == "intrinsic" else None)
+    return FramedField(field, motion_in_frame, motion_in_frame, (net, net) if name == "intrinsic" else None)
 
 
 def _held(field: PoseField) -> PoseField:
@@ -78,20 +78,20 @@ def _held(field: PoseField) -> PoseField:
     return PoseField(field.init, pose)
 
 
-def gauge(
+def reference_frame(
     name: FrameName,
     t_s: float,
     T_world_ref: np.ndarray,
     T_world_first: np.ndarray,
     generator: np.random.Generator,
-) -> Gauge:
+) -> ReferenceFrame:
     """The gauge at a last frame at `t_s` seconds: poses of the body there and at the first frame."""
     T_ref_field = np.eye(4)
     if name == "world":
         T_ref_field = np.linalg.inv(T_world_ref) @ T_world_first
     elif name == "random":
         T_ref_field = _perturbation(generator)
-    return Gauge(jnp.asarray(T_ref_field, jnp.float32), jnp.asarray(t_s, jnp.float32))
+    return ReferenceFrame(jnp.asarray(T_ref_field, jnp.float32), jnp.asarray(t_s, jnp.float32))
 
 
 def _perturbation(generator: np.random.Generator) -> np.ndarray:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxpose.geometry import se3
-from jaxpose.slam.map.integrate import Lookup
+from jaxpose.slam.map.integrate import MapSampler
 from jaxpose.slam.observation import Pixels, back_project, depth_sigma
 from jaxpose.slam.tracking.objective import Residuals, TrackConfig, colour_spread, image_loss, median
 
@@ -48,22 +48,22 @@ def starts(T_ref_body: Float[Array, "4 4"], sigma: Float[Array, "2"]) -> Float[A
 
 
 def best_start(
-    look_up: Lookup, T_world_cam: Float[Array, "k 4 4"], pixels: Pixels, *, count: int = 150
+    sample_map: MapSampler, T_world_cam: Float[Array, "k 4 4"], pixels: Pixels, *, count: int = 150
 ) -> Float[Array, "4 4"]:
     """The candidate pose that explains the first `count` pixels best; unexplained ones count as bad."""
     few = jax.tree.map(lambda x: x[:count], pixels)
 
     def score(T):
-        near = jax.vmap(look_up)(back_project(few, T))
+        near = jax.vmap(sample_map)(back_project(few, T))
         worst = 20.0
         off = jnp.minimum(jnp.abs(near.distance) / depth_sigma(few.depth), worst)
-        return jnp.mean(jnp.where((near.known > 0) & (few.depth > 0), off, worst))
+        return jnp.mean(jnp.where((near.valid > 0) & (few.depth > 0), off, worst))
 
     return T_world_cam[jnp.argmin(jax.lax.map(score, T_world_cam))]
 
 
 def surface_residuals(
-    look_up: Lookup, T_world_cam: Float[Array, "4 4"], pixels: Pixels, config: TrackConfig
+    sample_map: MapSampler, T_world_cam: Float[Array, "4 4"], pixels: Pixels, config: TrackConfig
 ) -> tuple[Residuals, Slopes]:
     """Residuals of measured points against the map's surface and its colour there, and their derivatives.
 
@@ -73,16 +73,16 @@ def surface_residuals(
     points = back_project(pixels, T_world_cam)
 
     def at(point):
-        near, change = jax.linearize(look_up, point)
+        near, change = jax.linearize(sample_map, point)
         return near, jax.vmap(change)(jnp.eye(3, dtype=point.dtype))
 
     near, along = jax.vmap(at)(points)
     steep = jnp.linalg.norm(along.distance, axis=-1)
-    known = (pixels.depth > 0) & (near.known > 0) & (steep > _FLAT)
+    valid = (pixels.depth > 0) & (near.valid > 0) & (steep > _FLAT)
     steep = jnp.maximum(steep, _FLAT)
     distance = near.distance / steep
     away = jnp.abs(distance)
-    inlier = known & (away < jnp.maximum(config.sample.band, 3 * median(away, known)))
+    inlier = valid & (away < jnp.maximum(config.sample.band, 3 * median(away, valid)))
     sigma = depth_sigma(pixels.depth)
     coloured = inlier & (away < config.sample.band)
     gain = exposure(near.rgb, pixels.rgb, coloured)
@@ -117,7 +117,7 @@ def exposure(
 
 
 def align(
-    look_up: Lookup,
+    sample_map: MapSampler,
     T_world_cam: Float[Array, "4 4"],
     T_world_predicted: Float[Array, "4 4"],
     sigma: Float[Array, "2"],
@@ -133,7 +133,7 @@ def align(
     prior = jnp.repeat(sigma, 3) ** -2
 
     def equations(T):
-        found, by = surface_residuals(look_up, T, pixels, config)
+        found, by = surface_residuals(sample_map, T, pixels, config)
         residual = jnp.concatenate([found.depth, found.colour.reshape(-1)])
         slope = jnp.concatenate([by.depth, by.colour.reshape(-1, 6)])
         w_depth = found.inlier / jnp.maximum(jnp.abs(found.depth), 1)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxpose.geometry import se3
-from jaxpose.slam.map.integrate import Lookup
+from jaxpose.slam.map.integrate import MapSampler
 from jaxpose.slam.observation import Pixels, back_project
 
 FOUND_SIGMA = (0.04, 0.03)  # [m, rad] how far off the pose that a search finds may be
@@ -23,8 +23,8 @@ _COLOUR_SCALE = 0.3
 _PRIOR = 0.02  # what a sigma along one axis costs
 
 
-def search(
-    look_up: Lookup,
+def relocalise(
+    sample_map: MapSampler,
     T_world_cam: Float[Array, "k 4 4"],
     sigma: Float[Array, "2"],
     pixels: Pixels,
@@ -39,7 +39,7 @@ def search(
 
     def score(T):
         away = se3.log(se3.compose(se3.inverse(T_world_cam), T[None])) / axes[None]
-        return mismatch(look_up, T, pixels) + _PRIOR * jnp.min(jnp.sum(away**2, axis=-1))
+        return mismatch(sample_map, T, pixels) + _PRIOR * jnp.min(jnp.sum(away**2, axis=-1))
 
     def improve(best, at):
         spread, key = at
@@ -55,11 +55,11 @@ def search(
     return best[0]
 
 
-def mismatch(look_up: Lookup, T_world_cam: Float[Array, "4 4"], pixels: Pixels) -> Float[Array, ""]:
+def mismatch(sample_map: MapSampler, T_world_cam: Float[Array, "4 4"], pixels: Pixels) -> Float[Array, ""]:
     """How badly measured points fit the map: distance and colour, 0 to 1.5, a mean over pixels with depth."""
-    near = jax.vmap(look_up)(back_project(pixels, T_world_cam))
+    near = jax.vmap(sample_map)(back_project(pixels, T_world_cam))
     off = jnp.minimum(jnp.abs(near.distance) / _FAR, 1)
     colour = jnp.mean(jnp.abs(near.rgb - pixels.rgb), axis=-1) / _COLOUR_SCALE
-    cost = jnp.where(near.known > 0, off + _COLOUR * jnp.minimum(colour, 1), 1 + _COLOUR)
+    cost = jnp.where(near.valid > 0, off + _COLOUR * jnp.minimum(colour, 1), 1 + _COLOUR)
     seen = (pixels.depth > 0).astype(cost.dtype)
     return jnp.sum(cost * seen) / jnp.maximum(jnp.sum(seen), 1)

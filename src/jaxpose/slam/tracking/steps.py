@@ -15,17 +15,17 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, Int
 
-from jaxpose.fields import Params, pin
+from jaxpose.fields import Params, project_onto_poses
 from jaxpose.fields.intrinsic_motion import dof_loss
 from jaxpose.geometry import se3
 from jaxpose.geometry.camera import Camera
 from jaxpose.imu import ResidualSigmas
 from jaxpose.scenes import SceneField
-from jaxpose.slam.map.integrate import Nearby
+from jaxpose.slam.map.integrate import MapSample
 from jaxpose.slam.observation import sample_pixels
 from jaxpose.slam.tracking.objective import ImuWeights, TrackConfig, image_loss, image_residuals, imu_loss
-from jaxpose.slam.tracking.predict import AHEAD, Interval
-from jaxpose.slam.tracking.reference_frames import Framed, Gauge, Motion
+from jaxpose.slam.tracking.predict import AHEAD, TrackingProblem
+from jaxpose.slam.tracking.reference_frames import FramedField, Motion, ReferenceFrame
 from jaxpose.slam.tracking.register import align, best_start, pose_sigma, starts
 
 _POSE_SIGMA = 2e-3  # [m, rad] what the field should keep to poses within
@@ -45,82 +45,87 @@ class Tracked(NamedTuple):
     sigma: Float[Array, "2"]  # [m, rad] of the pose, by what the image says of it; NaN: not known
 
 
-class Settle(NamedTuple):
+class FieldUpdate(NamedTuple):
     """What brings the field to a motion; compiled apart from the map, whose size may change.
 
-    `motion` is the field's since the last frame, `beside` its loss beside the image's: against the readings,
-    and for few degrees of freedom in the intrinsic frame. `bring` is Adam's way to a motion and to those,
-    `pinned` that and Newton's to the poses at `interval.stamps[AHEAD - 1:]`, the first of them `T_ref_body`.
+    `motion` is the field's since the last frame, `auxiliary_loss` its loss beside the image's: against the
+    readings, and for few degrees of freedom in the intrinsic frame. `fit` is Adam's way to a motion and to
+    those, `project` that and Newton's to the poses at `interval.timestamps[AHEAD - 1:]`, the first of them
+    `T_ref_body`.
     """
 
     motion: Motion
-    beside: Callable[[Params, Gauge, Interval], Float[Array, ""]]
-    bring: Callable[[Params, Gauge, Interval], Params]
-    pinned: Callable[[Params, Gauge, Interval, Float[Array, "4 4"]], Params]
+    auxiliary_loss: Callable[[Params, ReferenceFrame, TrackingProblem], Float[Array, ""]]
+    fit: Callable[[Params, ReferenceFrame, TrackingProblem], Params]
+    project: Callable[[Params, ReferenceFrame, TrackingProblem, Float[Array, "4 4"]], Params]
 
 
-def make_settle(
-    framed: Framed,
+def make_field_update(
+    framed: FramedField,
     config: TrackConfig,
     weights: ImuWeights,
     sigmas: ResidualSigmas,
     angle_of_view: float,
-) -> Settle:
+) -> FieldUpdate:
     """The field's part of tracking, for a frame of reference and inertial weights."""
     motion = framed.motion
 
-    def beside(params, gauge, interval):
-        total = imu_loss(motion(params, gauge), interval, weights, sigmas)
+    def auxiliary_loss(params, reference_frame, interval):
+        total = imu_loss(motion(params, reference_frame), interval, weights, sigmas)
         if framed.parts is not None:
             _, inner = framed.parts
-            T_inner = inner.pose(params["inner"], interval.t + gauge.clock)
+            T_inner = inner.pose(params["inner"], interval.t + reference_frame.clock)
             total = total + config.dof_weight * dof_loss(T_inner, angle_of_view)
         return total
 
-    def descend(params, gauge, interval, stamps, T_ref_body):
+    def descend(params, reference_frame, interval, timestamps, T_ref_body):
         def loss(params, i):
             del i
-            error = jax.vmap(motion(params, gauge))(stamps) - T_ref_body
+            error = jax.vmap(motion(params, reference_frame))(timestamps) - T_ref_body
             square = jnp.sum(error[:, :3] ** 2, axis=(-2, -1)) / _POSE_SIGMA**2
             # Square near zero, so that Adam settles; else by size.
-            return jnp.mean(jnp.sqrt(1 + square)) + beside(params, gauge, interval), jnp.zeros(0)
+            return jnp.mean(jnp.sqrt(1 + square)) + auxiliary_loss(
+                params, reference_frame, interval
+            ), jnp.zeros(0)
 
         return _descend(loss, params, config, config.field_steps, config.field_steps)[0][0]
 
-    def bring(params, gauge, interval):
-        return descend(params, gauge, interval, interval.stamps, interval.T_ref_body)
+    def fit(params, reference_frame, interval):
+        return descend(params, reference_frame, interval, interval.timestamps, interval.T_ref_body)
 
     @jax.jit
-    def pinned(before, gauge, interval, T_ref_body):
+    def project(before, reference_frame, interval, T_ref_body):
         # The motion found at this frame, and that of the frames before.
-        stamps = interval.stamps[AHEAD - 1 :]
+        timestamps = interval.timestamps[AHEAD - 1 :]
         poses = interval.T_ref_body[AHEAD - 1 :].at[0].set(T_ref_body)
-        params = descend(before, gauge, interval, stamps, poses) if any(weights) else before
-        params = pin(lambda p: jax.vmap(framed.direct(p, gauge))(stamps), params, poses)
+        params = descend(before, reference_frame, interval, timestamps, poses) if any(weights) else before
+        params = project_onto_poses(
+            lambda p: jax.vmap(framed.direct(p, reference_frame))(timestamps), params, poses
+        )
         # Newton's steps can end far off, or nowhere: the next frame then starts from what was there before.
-        arrived = jnp.abs(motion(params, gauge)(interval.t) - T_ref_body).max() < 10 * _POSE_SIGMA
+        arrived = jnp.abs(motion(params, reference_frame)(interval.t) - T_ref_body).max() < 10 * _POSE_SIGMA
         return jax.tree.map(lambda new, old: jnp.where(arrived, new, old), params, before)
 
-    return Settle(motion, beside, bring, pinned)
+    return FieldUpdate(motion, auxiliary_loss, fit, project)
 
 
 def make_track(
     scene: SceneField,
-    look_up: Callable[[Params, Any, Float[Array, "3"]], Nearby],
+    sample_map: Callable[[Params, Any, Float[Array, "3"]], MapSample],
     camera: Camera,
     T_body_cam: Float[Array, "4 4"],
     config: TrackConfig,
-    settle: Settle,
+    field_update: FieldUpdate,
 ):
     """The step `track(scene_params, memory, params, T_world_ref, gauge, interval, image, far, key)`.
 
-    It returns `Tracked`. `look_up(scene_params, memory, point)` is the map as alignment reads it. Its inner
-    loops are compiled; the field starts from its own parameters `params`.
+    It returns `Tracked`. `sample_map(scene_params, memory, point)` is the map as alignment reads it. Its
+    inner loops are compiled; the field starts from its own parameters `params`.
     """
 
     @jax.jit
-    def aligned(scene_params, memory, T_world_ref, interval, image, key):
-        look = partial(look_up, scene_params, memory)
+    def aligned(scene_params, fusion_state, T_world_ref, interval, image, key):
+        look = partial(sample_map, scene_params, fusion_state)
         pixels = sample_pixels(key, image, camera, config.pixels, edge=config.edge)
         tries = starts(interval.T_ref_body[AHEAD - 1], interval.sigma)
         T_world_tries = se3.compose(T_world_ref, se3.compose(tries, T_body_cam))
@@ -138,30 +143,32 @@ def make_track(
         )
         return se3.compose(se3.inverse(T_world_ref), T_world_body), seen
 
-    def gauss_newton(scene_params, memory, params, T_world_ref, gauge, interval, image, far, key):
+    def gauss_newton(
+        scene_params, fusion_state, params, T_world_ref, reference_frame, interval, image, far, key
+    ):
         del far  # nothing is rendered
-        T_ref_body, seen = aligned(scene_params, memory, T_world_ref, interval, image, key)
-        return Tracked(settle.pinned(params, gauge, interval, T_ref_body), T_ref_body, *seen)
+        T_ref_body, seen = aligned(scene_params, fusion_state, T_world_ref, interval, image, key)
+        return Tracked(field_update.project(params, reference_frame, interval, T_ref_body), T_ref_body, *seen)
 
     @jax.jit
-    def gradient(scene_params, memory, params, T_world_ref, gauge, interval, image, far, key):
-        del memory
-        params = settle.bring(params, gauge, interval)
+    def gradient(scene_params, fusion_state, params, T_world_ref, reference_frame, interval, image, far, key):
+        del fusion_state
+        params = field_update.fit(params, reference_frame, interval)
         query = partial(scene.query, scene_params)
 
         def loss(params, i):
             pixels = sample_pixels(jax.random.fold_in(key, i), image, camera, config.pixels, edge=config.edge)
-            T_ref_body = settle.motion(params, gauge)(interval.t)
+            T_ref_body = field_update.motion(params, reference_frame)(interval.t)
             T_world_cam = se3.compose(T_world_ref, se3.compose(T_ref_body, T_body_cam))
             found = image_residuals(query, T_world_cam, pixels, far, config)
             total = image_loss(found, config)
             seen = jnp.stack([total, found.depth_error, found.colour_error, found.valid])
-            return total + settle.beside(params, gauge, interval), seen
+            return total + field_update.auxiliary_loss(params, reference_frame, interval), seen
 
         (params, (total, depth_error, colour_error, valid)), i = _descend(
             loss, params, config, config.iterations, config.patience
         )
-        T_ref_body, unknown = settle.motion(params, gauge)(interval.t), jnp.full(2, jnp.nan)
+        T_ref_body, unknown = field_update.motion(params, reference_frame)(interval.t), jnp.full(2, jnp.nan)
         exposure = jnp.asarray(image.exposure)
         return Tracked(params, T_ref_body, total, depth_error, colour_error, exposure, valid, i, unknown)
 
