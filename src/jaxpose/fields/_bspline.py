@@ -58,9 +58,10 @@ def control_points(control_poses: Float[Array, "n 4 4"]) -> Float[Array, "n 7"]:
 def control_points_along(
     times: Float[np.ndarray, " m"], poses: Float[np.ndarray, "m 4 4"], intervals: int
 ) -> Float[Array, "n 7"]:
-    """The parameters of a spline over stamped poses whose control poses lie on them (`piecewise_geodesic`).
+    """The parameters of a spline over stamped poses whose control poses lie on them.
 
-    They are a start for a fit. The span is from the first of `times` [s] to the last, in `intervals` knot intervals.
+    They are a start for a fit. The span is from the first of `times` [s] to the last, in `intervals` knot
+    intervals.
     """
     first, last = float(times[0]), float(times[-1])
     knots = first + (np.arange(intervals + 3) - 1) * ((last - first) / intervals)
