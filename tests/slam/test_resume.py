@@ -22,8 +22,9 @@ import os, signal, sys
 import jax
 jax.config.update("jax_disable_most_optimizations", True)
 from pathlib import Path
-from jaxpose.experiments import rgbd_slam, slam_keep
-slam_keep.SAVE_EVERY_S = 0.0
+from jaxpose.experiments import rgbd_slam
+from jaxpose.experiments.slam import callbacks
+callbacks.SAVE_EVERY_S = 0.0
 def on_frame(mode, progress):
     if len(sys.argv) > 2 and progress.index == 4:
         os.kill(os.getpid(), signal.SIGKILL)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers.bounding_grid import box_pixels, inside_of_a_box
+from helpers.box import box_pixels, inside_of_a_box
 
 from jaxpose.datasets.synthetic import RoomConfig, room
 from jaxpose.datasets.types import Frame, Recording, select
@@ -26,7 +26,7 @@ BAND = 0.3
 def truncated_box(point):
     """The box as a map knows it: distances up to a band."""
     near = inside_of_a_box(point)
-    return near._replace(known=(jnp.abs(near.distance) < BAND).astype(near.distance.dtype))
+    return near._replace(valid=(jnp.abs(near.distance) < BAND).astype(near.distance.dtype))
 
 
 def off(T, ground_truth):

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers.bounding_grid import UPPER, box_pixels, inside_of_a_box
+from helpers.box import UPPER, box_pixels, inside_of_a_box
 from scipy.spatial.transform import Rotation
 
 from jaxpose.datasets.types import Frame, Recording

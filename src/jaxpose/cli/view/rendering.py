@@ -26,7 +26,7 @@ def of_map(file: Path, camera: Camera, poses: Poses) -> Render:
     """The map of a SLAM run from where `poses` is at a time, light grey where it has no surface."""
     saved = map_files.read_map(file)
     look = map_files.viewer(textured(scenes.grid(saved.grid), saved.grid), saved.grid, camera)
-    params = (jnp.asarray(saved.values), jax.tree.map(jnp.asarray, saved.make_texture))
+    params = (jnp.asarray(saved.values), jax.tree.map(jnp.asarray, saved.texture))
 
     def render(t: float, width: int) -> Picture:
         return _picture(look(params, poses(np.array([t]))[0], map_files.every(camera, width))[0])

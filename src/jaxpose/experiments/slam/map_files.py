@@ -62,7 +62,7 @@ class SavedMap(NamedTuple):
 
     grid: GridConfig
     values: Float[np.ndarray, "x y z 4"]  # of the finest level: signed distance [m], red, green, blue
-    make_texture: Texture  # finer colour on the surface
+    texture: Texture  # finer colour on the surface
     keyframes: Int[np.ndarray, " k"]  # frames, counted from the first of the trajectory
 
 
@@ -169,7 +169,7 @@ def every(camera: Camera, width: int) -> Int[np.ndarray, "h w 2"]:
 def write_map(path: Path | str, saved: SavedMap) -> None:
     """Write a map (npz, compressed): version, the fields of its `GridConfig`, values, paint, keyframes."""
     arrays = asdict(saved.grid) | {"values": saved.values, "keyframes": saved.keyframes}
-    arrays |= {f"paint_{name}": array for name, array in saved.make_texture._asdict().items()}
+    arrays |= {f"paint_{name}": array for name, array in saved.texture._asdict().items()}
     with atomic.atomic(path) as temporary:
         np.savez_compressed(temporary, allow_pickle=False, version=_VERSION, **arrays)
 
