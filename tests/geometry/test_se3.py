@@ -3,6 +3,7 @@
 Each test compiles once for all angles and axes, so a failure names the row of `ANGLES` x `AXES`.
 """
 
+import inspect
 import math
 
 import jax
@@ -362,3 +363,49 @@ def test_one_transform_meets_many():
     assert_close(se3.compose(many, T), exact @ exact[2], 1e-6)
     assert_close(se3.apply(T, points), exact_points @ exact[2, :3, :3].T + exact[2, :3, 3], 1e-6)
     assert se3.apply(many[:, None], points[None, :4]).shape == (6, 4, 3)
+
+
+@pytest.mark.parametrize(
+    ("name", "shapes", "message"),
+    [
+        ("hat", [(4,)], "hat: omega: expected shape (..., 3), got (4,)"),
+        ("vee", [(4, 4)], "vee: W: expected shape (..., 3, 3), got (4, 4)"),
+        ("so3_exp", [(2,)], "so3_exp: phi: expected shape (..., 3), got (2,)"),
+        ("so3_log", [(4, 4)], "so3_log: R: expected shape (..., 3, 3), got (4, 4)"),
+        ("exp", [(5,)], "exp: xi: expected shape (..., 6), got (5,)"),
+        ("exp", [()], "exp: xi: expected shape (..., 6), got ()"),
+        ("log", [(3, 4)], "log: T: expected shape (..., 4, 4), got (3, 4)"),
+        ("make", [(3, 3), (4,)], "make: translation: expected shape (..., 3), got (4,)"),
+        ("make", [(3, 3), (2, 3)], "make: expected rotation and translation with the same leading axes"),
+        ("compose", [(3, 4), (4, 4)], "compose: T_a_b: expected shape (..., 4, 4), got (3, 4)"),
+        ("inverse", [(3, 3)], "inverse: T_a_b: expected shape (..., 4, 4), got (3, 3)"),
+        ("apply", [(4, 4), (2,)], "apply: point_b: expected shape (..., 3), got (2,)"),
+        ("apply", [(4, 4), (4,)], "apply: point_b: expected shape (..., 3), got (4,)"),
+        ("apply", [(3, 3), (3,)], "apply: T_a_b: expected shape (..., 4, 4), got (3, 3)"),
+        (
+            "apply",
+            [(5, 4, 4), (2, 3)],
+            "apply: expected leading axes that broadcast, got T_a_b (5,), point_b",
+        ),
+        ("adjoint", [(3, 4)], "adjoint: T_a_b: expected shape (..., 4, 4), got (3, 4)"),
+        ("interpolate", [(4, 4), (3, 4), ()], "interpolate: T_w_b: expected shape (..., 4, 4), got (3, 4)"),
+        (
+            "interpolate",
+            [(5, 4, 4), (5, 4, 4), (5, 1)],
+            "interpolate: fraction: expected shape (5,), got (5, 1)",
+        ),
+        ("quaternion_multiply", [(4,), (3,)], "quaternion_multiply: b: expected shape (..., 4), got (3,)"),
+        ("quaternion_conjugate", [(3,)], "quaternion_conjugate: q: expected shape (..., 4), got (3,)"),
+        ("quaternion_exp", [(4,)], "quaternion_exp: phi: expected shape (..., 3), got (4,)"),
+        ("quaternion_to_rotation", [(3,)], "quaternion_to_rotation: q: expected shape (..., 4), got (3,)"),
+        ("rotation_to_quaternion", [(4, 4)], "rotation_to_quaternion: R: expected shape (..., 3, 3), got"),
+    ],
+)
+def test_a_shape_that_means_nothing_is_refused_by_name(name, shapes, message):
+    """As users see it: without the checks of annotations that the tests put around every function."""
+    function = inspect.unwrap(getattr(se3, name))
+    with pytest.raises(ValueError) as refused:
+        function(*(jnp.zeros(shape) for shape in shapes))
+    assert str(refused.value).startswith(message)
+    with pytest.raises(ValueError):
+        jax.jit(function)(*(jnp.zeros(shape) for shape in shapes))

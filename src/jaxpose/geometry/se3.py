@@ -5,6 +5,9 @@ acts on the right: `T . exp(xi)`. Quaternions are wxyz. Where two arguments have
 
 Every singular point (angle 0, angle pi) has a series or a branch without division by zero, so values and
 derivatives up to second order are finite and right in float32 and float64.
+
+Every function raises a ValueError that names the argument for a shape it is not made for. Shapes are known
+when a function is traced, so a compiled function pays nothing for it.
 """
 
 import math
@@ -25,31 +28,93 @@ _COTANGENT = [b / math.factorial(2 * k) for k, b in enumerate(_BERNOULLI, start=
 
 
 def hat(omega: Float[Array, "*n 3"]) -> Float[Array, "*n 3 3"]:
-    """The skew-symmetric matrix W with `W p = omega x p`."""
+    """The skew-symmetric matrix W of a vector, with `W p = omega x p`.
+
+    Args:
+        omega: vectors (..., 3).
+
+    Returns:
+        Matrices (..., 3, 3).
+
+    >>> print(hat(jnp.array([1.0, 2.0, 3.0])))
+    [[ 0. -3.  2.]
+     [ 3.  0. -1.]
+     [-2.  1.  0.]]
+    """
+    _require("hat", omega=(omega, 3))
     x, y, z = (omega[..., i] for i in range(3))
     zero = jnp.zeros_like(x)
     return jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*omega.shape, 3)
 
 
 def vee(W: Float[Array, "*n 3 3"]) -> Float[Array, "*n 3"]:
-    """The vector of the skew-symmetric part of W; the inverse of `hat`."""
+    """The vector of the skew-symmetric part of a matrix; the inverse of `hat`.
+
+    Args:
+        W: matrices (..., 3, 3); their symmetric part does not matter.
+
+    Returns:
+        Vectors (..., 3).
+
+    >>> print(vee(hat(jnp.array([1.0, 2.0, 3.0]))))
+    [1. 2. 3.]
+    """
+    _require("vee", W=(W, 3, 3))
     return 0.5 * jnp.stack(
         [W[..., 2, 1] - W[..., 1, 2], W[..., 0, 2] - W[..., 2, 0], W[..., 1, 0] - W[..., 0, 1]], axis=-1
     )
 
 
 def so3_exp(phi: Float[Array, "*n 3"]) -> Float[Array, "*n 3 3"]:
-    """The rotation about `phi` by its length [rad]."""
+    """The rotation about `phi` by its length.
+
+    Args:
+        phi: rotation vectors (..., 3) [rad].
+
+    Returns:
+        Rotation matrices (..., 3, 3).
+
+    >>> print(so3_exp(jnp.array([0.0, 0.0, jnp.pi / 2])).round(6) + 0.0)
+    [[ 0. -1.  0.]
+     [ 1.  0.  0.]
+     [ 0.  0.  1.]]
+    """
+    _require("so3_exp", phi=(phi, 3))
     return _rotation(phi, *_exp_coefficients(_dot(phi, phi))[:2])
 
 
 def so3_log(R: Float[Array, "*n 3 3"]) -> Float[Array, "*n 3"]:
-    """The rotation vector [rad] of R, of length at most pi; at pi one of the two axes."""
+    """The rotation vector of a rotation matrix, of length at most pi; at pi one of the two axes.
+
+    Args:
+        R: rotation matrices (..., 3, 3).
+
+    Returns:
+        Rotation vectors (..., 3) [rad].
+
+    >>> print(so3_log(so3_exp(jnp.array([0.0, 0.5, 0.0]))).round(6) + 0.0)
+    [0.  0.5 0. ]
+    """
+    _require("so3_log", R=(R, 3, 3))
     return _quaternion_log(rotation_to_quaternion(R))[0]
 
 
 def exp(xi: Float[Array, "*n 6"]) -> Float[Array, "*n 4 4"]:
-    """The transform that the constant twist `xi` reaches in unit time."""
+    """The transform that a constant twist reaches in unit time.
+
+    Args:
+        xi: twists (..., 6), [translation, rotation] [m, rad].
+
+    Returns:
+        Transforms (..., 4, 4).
+
+    >>> print(exp(jnp.array([1.0, 2.0, 3.0, 0.0, 0.0, 0.0])))
+    [[1. 0. 0. 1.]
+     [0. 1. 0. 2.]
+     [0. 0. 1. 3.]
+     [0. 0. 0. 1.]]
+    """
+    _require("exp", xi=(xi, 6))
     rho, phi = xi[..., :3], xi[..., 3:]
     square = _dot(phi, phi)
     a, b, c = _exp_coefficients(square)
@@ -58,7 +123,18 @@ def exp(xi: Float[Array, "*n 6"]) -> Float[Array, "*n 4 4"]:
 
 
 def log(T: Float[Array, "*n 4 4"]) -> Float[Array, "*n 6"]:
-    """The twist of least rotation (at most pi) with `exp(xi) = T`."""
+    """The twist of least rotation (at most pi) that reaches a transform in unit time: `exp(log(T)) = T`.
+
+    Args:
+        T: transforms (..., 4, 4).
+
+    Returns:
+        Twists (..., 6), [translation, rotation] [m, rad].
+
+    >>> print(log(exp(jnp.array([1.0, 2.0, 3.0, 0.0, 0.5, 0.0]))).round(5) + 0.0)
+    [1.  2.  3.  0.  0.5 0. ]
+    """
+    _require("log", T=(T, 4, 4))
     phi, half_cot = _quaternion_log(rotation_to_quaternion(T[..., :3, :3]))
     square = _dot(phi, phi)
     near = square < 1
@@ -70,31 +146,94 @@ def log(T: Float[Array, "*n 4 4"]) -> Float[Array, "*n 6"]:
 
 
 def make(rotation: Float[Array, "*n 3 3"], translation: Float[Array, "*n 3"]) -> Float[Array, "*n 4 4"]:
-    """The transform `p -> rotation p + translation`."""
+    """The transform `p -> rotation p + translation`.
+
+    Args:
+        rotation: (..., 3, 3).
+        translation: (..., 3) [m], with the same leading axes.
+
+    Returns:
+        Transforms (..., 4, 4).
+
+    >>> print(make(jnp.eye(3), jnp.array([1.0, 2.0, 3.0])))
+    [[1. 0. 0. 1.]
+     [0. 1. 0. 2.]
+     [0. 0. 1. 3.]
+     [0. 0. 0. 1.]]
+    """
+    _require("make", rotation=(rotation, 3, 3), translation=(translation, 3))
+    if rotation.shape[:-2] != translation.shape[:-1]:
+        raise ValueError(
+            f"make: expected rotation and translation with the same leading axes, got {rotation.shape} and "
+            f"{translation.shape}"
+        )
     upper = jnp.concatenate([rotation, translation[..., None]], axis=-1)
     last = jnp.broadcast_to(jnp.eye(4, dtype=upper.dtype)[3:], (*upper.shape[:-2], 1, 4))
     return jnp.concatenate([upper, last], axis=-2)
 
 
 def compose(T_a_b: Float[Array, "*#n 4 4"], T_b_c: Float[Array, "*#n 4 4"]) -> Float[Array, "*n 4 4"]:
-    """Chain two transforms; the inner frame `b` cancels."""
+    """Chain two transforms; the inner frame `b` cancels.
+
+    Args:
+        T_a_b, T_b_c: transforms (..., 4, 4), whose leading axes broadcast.
+
+    Returns:
+        `T_a_c` (..., 4, 4), computed in full precision on every device.
+
+    >>> T = compose(exp(jnp.array([1.0, 0, 0, 0, 0, 0])), exp(jnp.array([0, 2.0, 0, 0, 0, 0])))
+    >>> print(T[:3, 3])
+    [1. 2. 0.]
+    """
+    _require("compose", T_a_b=(T_a_b, 4, 4), T_b_c=(T_b_c, 4, 4))
     return _product(T_a_b, T_b_c)
 
 
 def inverse(T_a_b: Float[Array, "*n 4 4"]) -> Float[Array, "*n 4 4"]:
-    """`T_b_a`, taking the rotation as orthonormal."""
+    """`T_b_a`, taking the rotation as orthonormal.
+
+    Args:
+        T_a_b: transforms (..., 4, 4).
+
+    Returns:
+        `T_b_a` (..., 4, 4).
+
+    >>> print(inverse(exp(jnp.array([1.0, 2.0, 3.0, 0.0, 0.0, 0.0])))[:3, 3])
+    [-1. -2. -3.]
+    """
+    _require("inverse", T_a_b=(T_a_b, 4, 4))
     R_b_a = jnp.swapaxes(T_a_b[..., :3, :3], -1, -2)
     return make(R_b_a, -_rotate(R_b_a, T_a_b[..., :3, 3]))
 
 
 def apply(T_a_b: Float[Array, "*#n 4 4"], point_b: Float[Array, "*#n 3"]) -> Float[Array, "*n 3"]:
-    """The coordinates in frame a of points known in frame b."""
+    """The coordinates in frame a of points known in frame b.
+
+    Args:
+        T_a_b: transforms (..., 4, 4).
+        point_b: points (..., 3) [m]; the leading axes of both broadcast.
+
+    Returns:
+        Points (..., 3) [m].
+
+    >>> print(apply(exp(jnp.array([1.0, 2.0, 3.0, 0.0, 0.0, 0.0])), jnp.array([0.5, 0.0, 0.0])))
+    [1.5 2.  3. ]
+    """
+    _require("apply", T_a_b=(T_a_b, 4, 4), point_b=(point_b, 3))
     rotated = _rotate(T_a_b[..., :3, :3], point_b)
     return rotated + jnp.broadcast_to(T_a_b[..., :3, 3], rotated.shape)
 
 
 def adjoint(T_a_b: Float[Array, "*n 4 4"]) -> Float[Array, "*n 6 6"]:
-    """The matrix that moves a twist from frame b to a: `T exp(xi) T^-1 = exp(adjoint(T) xi)`."""
+    """The matrix that moves a twist from frame b to a: `T exp(xi) T^-1 = exp(adjoint(T) xi)`.
+
+    Args:
+        T_a_b: transforms (..., 4, 4).
+
+    Returns:
+        Matrices (..., 6, 6) on twists [translation, rotation] (Sola et al. 2018, eq. 31).
+    """
+    _require("adjoint", T_a_b=(T_a_b, 4, 4))
     R = T_a_b[..., :3, :3]
     upper = jnp.concatenate([R, _product(hat(T_a_b[..., :3, 3]), R)], axis=-1)
     lower = jnp.concatenate([jnp.zeros_like(R), R], axis=-1)
@@ -102,14 +241,42 @@ def adjoint(T_a_b: Float[Array, "*n 4 4"]) -> Float[Array, "*n 6 6"]:
 
 
 def interpolate(
-    T_w_a: Float[Array, "*n 4 4"], T_w_b: Float[Array, "*n 4 4"], fraction: Float[Array, "*n"]
+    T_w_a: Float[Array, "*#n 4 4"], T_w_b: Float[Array, "*#n 4 4"], fraction: Float[Array, "*#n"]
 ) -> Float[Array, "*n 4 4"]:
-    """The pose at a fraction (0 to 1) of the way from a to b at constant twist."""
+    """The pose at a fraction of the way from a to b at constant twist.
+
+    Args:
+        T_w_a, T_w_b: poses (..., 4, 4).
+        fraction: 0 (at a) to 1 (at b), one number or one for each pose; poses without leading axes take any.
+
+    Returns:
+        Poses (..., 4, 4).
+
+    >>> T = exp(jnp.array([1.0, 0.0, 0.0, 0.0, 0.0, 2.0]))
+    >>> print(log(interpolate(jnp.eye(4), T, jnp.array(0.25))).round(5) + 0.0)
+    [0.25 0.   0.   0.   0.   0.5 ]
+    """
+    _require("interpolate", T_w_a=(T_w_a, 4, 4), T_w_b=(T_w_b, 4, 4))
+    batch = jnp.broadcast_shapes(T_w_a.shape[:-2], T_w_b.shape[:-2])
+    if batch and fraction.shape and fraction.shape != batch:
+        raise ValueError(f"interpolate: fraction: expected shape {batch}, got {fraction.shape}")
     return compose(T_w_a, exp(fraction[..., None] * log(compose(inverse(T_w_a), T_w_b))))
 
 
 def quaternion_multiply(a: Float[Array, "*#n 4"], b: Float[Array, "*#n 4"]) -> Float[Array, "*n 4"]:
-    """The Hamilton product; as a rotation, b first and then a."""
+    """The Hamilton product of two quaternions; as a rotation, b first and then a.
+
+    Args:
+        a, b: quaternions wxyz (..., 4), whose leading axes broadcast.
+
+    Returns:
+        Quaternions wxyz (..., 4).
+
+    >>> i, j = jnp.array([0.0, 1.0, 0.0, 0.0]), jnp.array([0.0, 0.0, 1.0, 0.0])
+    >>> print(quaternion_multiply(i, j))
+    [0. 0. 0. 1.]
+    """
+    _require("quaternion_multiply", a=(a, 4), b=(b, 4))
     (aw, ax, ay, az), (bw, bx, by, bz) = ([q[..., i] for i in range(4)] for q in jnp.broadcast_arrays(a, b))
     return jnp.stack(
         [
@@ -123,25 +290,68 @@ def quaternion_multiply(a: Float[Array, "*#n 4"], b: Float[Array, "*#n 4"]) -> F
 
 
 def quaternion_conjugate(q: Float[Array, "*n 4"]) -> Float[Array, "*n 4"]:
-    """The inverse rotation of a unit quaternion."""
+    """The inverse rotation of a unit quaternion.
+
+    Args:
+        q: quaternions wxyz (..., 4).
+
+    Returns:
+        Quaternions wxyz (..., 4).
+    """
+    _require("quaternion_conjugate", q=(q, 4))
     return jnp.concatenate([q[..., :1], -q[..., 1:]], axis=-1)
 
 
 def quaternion_exp(phi: Float[Array, "*n 3"]) -> Float[Array, "*n 4"]:
-    """The unit quaternion of the rotation about `phi` by its length [rad]."""
+    """The unit quaternion of the rotation about `phi` by its length.
+
+    Args:
+        phi: rotation vectors (..., 3) [rad].
+
+    Returns:
+        Unit quaternions wxyz (..., 4).
+
+    >>> print(quaternion_exp(jnp.array([0.0, 0.0, jnp.pi])).round(6) + 0.0)
+    [0. 0. 0. 1.]
+    """
+    _require("quaternion_exp", phi=(phi, 3))
     square = 0.25 * _dot(phi, phi)
     a, b, _ = _exp_coefficients(square)
     return jnp.concatenate([1 - b * square, 0.5 * a * phi], axis=-1)
 
 
 def quaternion_to_rotation(q: Float[Array, "*n 4"]) -> Float[Array, "*n 3 3"]:
-    """The rotation of a quaternion of any length but zero."""
+    """The rotation of a quaternion of any length but zero.
+
+    Args:
+        q: quaternions wxyz (..., 4).
+
+    Returns:
+        Rotation matrices (..., 3, 3).
+
+    >>> print(quaternion_to_rotation(jnp.array([2.0, 0.0, 0.0, 0.0])))
+    [[1. 0. 0.]
+     [0. 1. 0.]
+     [0. 0. 1.]]
+    """
+    _require("quaternion_to_rotation", q=(q, 4))
     w, v = q[..., :1], q[..., 1:]
     return _rotation(v, 2 * w / _dot(q, q), 2 / _dot(q, q))
 
 
 def rotation_to_quaternion(R: Float[Array, "*n 3 3"]) -> Float[Array, "*n 4"]:
-    """The unit quaternion of R with w >= 0; jumps in sign only where the angle passes pi."""
+    """The unit quaternion with w >= 0 of a rotation; its sign jumps only where the angle passes pi.
+
+    Args:
+        R: rotation matrices (..., 3, 3).
+
+    Returns:
+        Unit quaternions wxyz (..., 4).
+
+    >>> print(rotation_to_quaternion(jnp.eye(3)))
+    [1. 0. 0. 0.]
+    """
+    _require("rotation_to_quaternion", R=(R, 3, 3))
     xx, yy, zz = (R[..., i, i] for i in range(3))
     xy, yz, zx = (R[..., i, j] + R[..., j, i] for i, j in ((0, 1), (1, 2), (2, 0)))
     wx, wy, wz = (R[..., j, i] - R[..., i, j] for i, j in ((1, 2), (2, 0), (0, 1)))
@@ -159,6 +369,22 @@ def rotation_to_quaternion(R: Float[Array, "*n 3 3"]) -> Float[Array, "*n 4"]:
     largest = jax.nn.one_hot(jnp.argmax(jnp.stack(square, axis=-1), axis=-1), 4, dtype=R.dtype)
     q = _rotate(rows, largest)  # the rows are those of a symmetric matrix: its product with a unit vector
     return q * (jnp.where(q[..., :1] < 0, -1, 1) / jnp.sqrt(_dot(q, q)))
+
+
+def _require(function: str, **arguments: tuple) -> None:
+    """Raise ValueError unless each argument has its last axes and the leading ones of all broadcast."""
+    leading = {}
+    for name, (array, *last) in arguments.items():
+        shape = jnp.shape(array)
+        if shape[-len(last) :] != tuple(last):
+            expected = ", ".join(["...", *map(str, last)])
+            raise ValueError(f"{function}: {name}: expected shape ({expected}), got {shape}")
+        leading[name] = shape[: len(shape) - len(last)]
+    try:
+        jnp.broadcast_shapes(*leading.values())
+    except ValueError:
+        found = ", ".join(f"{name} {shape}" for name, shape in leading.items())
+        raise ValueError(f"{function}: expected leading axes that broadcast, got {found}") from None
 
 
 def _quaternion_log(q: Float[Array, "*n 4"]) -> tuple[Float[Array, "*n 3"], Float[Array, "*n 1"]]:
