@@ -96,7 +96,7 @@ def test_importing_them_brings_nothing_else():
     code = """
 import sys
 import jaxpose.fields, jaxpose.fields.derivatives, jaxpose.render, jaxpose.losses, jaxpose.imu
-parts = ("slam", "data", "experiments", "plots", "io", "recording", "scenes", "metrics")
+parts = ("slam", "datasets", "experiments", "plots", "scenes", "evaluation", "training", "cli")
 others = [f"jaxpose.{part}" for part in parts] + ["matplotlib", "imageio", "PIL", "tyro", "tqdm", "evo"]
 print([name for name in others if name in sys.modules])
 """

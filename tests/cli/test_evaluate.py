@@ -266,7 +266,8 @@ def test_wrong_calls_cost_one_line(files, tmp_path):
 def test_help_is_quick_and_says_what_there_is():
     """Without loading JAX or drawing; as `python -m jaxpose` too."""
     code = (
-        "import sys\nfrom jaxpose import cli\ntry: cli.main(['eval', '--help'])\nexcept SystemExit: pass\n"
+        "import sys\nfrom jaxpose.cli.main import main\n"
+        "try: main(['eval', '--help'])\nexcept SystemExit: pass\n"
         "print([name for name in ('jax', 'matplotlib', 'flax') if name in sys.modules])"
     )
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout

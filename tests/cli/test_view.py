@@ -31,7 +31,7 @@ from jaxpose.files.camera_json import write_camera
 from jaxpose.files.ply import write_ply
 from jaxpose.geometry.camera import Camera
 from jaxpose.scenes import GridConfig
-from jaxpose.slam.map.texture import Paint
+from jaxpose.slam.map.texture import Texture
 
 COUNT, LAST, FIRST, SPEED = 9, 2.0, 5.0, 0.3  # frames, span [s], first timestamp [s], along x [m/s]
 CAMERA = Camera(100.0, 100.0, 79.5, 59.5, 160, 120)
@@ -71,7 +71,7 @@ def run(tmp_path):
     values[..., 0] = np.clip(WALL - (grid.lower[2] + 0.1 * z), -0.3, 0.3)
     left = grid.lower[0] + 0.1 * x < 0.1
     values[..., 1], values[..., 3] = left, ~left
-    unpainted = Paint(np.zeros((6, 5, 3), np.int32), np.zeros((1, 17, 17, 17, 4), np.uint8))
+    unpainted = Texture(np.zeros((6, 5, 3), np.int32), np.zeros((1, 17, 17, 17, 4), np.uint8))
     write_map(folder / "map.npz", SavedMap(grid, values, unpainted, np.array([0, 4])))
     corners = np.array([[-1, -1, WALL], [1, -1, WALL], [1, 1, WALL]])
     write_ply(folder / "mesh.ply", corners, np.full((3, 3), 200, np.uint8), np.array([[0, 2, 1]]))

@@ -6,8 +6,8 @@ import sys
 
 import pytest
 
-BEFORE = "import jax; from jaxpose import command\n"
-LAZY = "from jaxpose import command\n"
+BEFORE = "import jax; from jaxpose.experiments import command\n"
+LAZY = "from jaxpose.experiments import command\n"
 ACTION = """
 def action():
     import jax

@@ -11,7 +11,7 @@ from jaxpose.fields import PoseNetConfig, intrinsic, posenet
 from jaxpose.fields.intrinsic_motion import components, dof_loss, effective_dof, outer_loss
 from jaxpose.geometry import se3
 from jaxpose.geometry.camera import Camera, angle_of_view
-from jaxpose.slam.tracking.intrinsic_frame import due, make_refit, window
+from jaxpose.slam.tracking.intrinsic_frame import is_due, make_refit, window
 
 VIEW = np.deg2rad(60)
 
@@ -78,5 +78,5 @@ def test_the_intrinsic_frame_takes_what_is_common_and_leaves_every_motion_as_it_
 
 def test_every_motion_is_in_a_window():
     for count in (2, 7, 11, 25):
-        covered = {int(k) for i in range(count) if due(i, count) for k in window(i)}
+        covered = {int(k) for i in range(count) if is_due(i, count) for k in window(i)}
         assert covered == set(range(1, count))

@@ -12,8 +12,12 @@ import numpy as np
 
 def whole_and_killed(experiment: str, args: str, steps: int, out: Path) -> tuple[dict, dict]:
     """Results of a training left alone, and of one killed in the middle of its steps and resumed."""
-    code = f"from jaxpose.experiments import joint_loop, {experiment}; joint_loop._SAVE_EVERY_S = 0; "
-    command = [sys.executable, "-c", f"{code}{experiment}.main()", *args.split(), "--steps", str(steps)]
+    code = (
+        f"from jaxpose.experiments import training_loop\n"
+        f"from jaxpose.experiments.{experiment} import pipeline\n"
+        "training_loop._SAVE_EVERY_S = 0; pipeline.main()"
+    )
+    command = [sys.executable, "-c", code, *args.split(), "--steps", str(steps)]
     start = lambda name: subprocess.Popen([*command, "--out", out / name, "--resume"])
     assert start("whole").wait() == 0
     process, checkpoint = start("killed"), out / "killed" / "checkpoint.npz"
