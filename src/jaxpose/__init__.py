@@ -1,5 +1,6 @@
 """A camera trajectory as a pure, differentiable function of time."""
 
-from importlib.metadata import version
+import lazy_loader
 
-__version__ = version("jaxpose")
+__version__ = "0.1.0"
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

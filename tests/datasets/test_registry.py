@@ -33,7 +33,7 @@ def test_formats_are_told_apart_and_their_loader_is_asked(tmp_path, name):
     touch(tmp_path, LAYOUTS[name])
     assert rgbd_registry.find_format(tmp_path) == rgbd_registry.find_format(str(tmp_path)) == name
     with pytest.raises(DataError, match=r"expected (an image|lines of a timestamp)"):
-        rgbd_registry.load(tmp_path)
+        rgbd_registry.load_recording(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -66,7 +66,7 @@ def test_a_wrong_folder_is_told_what_was_expected_and_found(tmp_path):
         (tmp_path / "nowhere", "nothing"),
     ]:
         with pytest.raises(DataError) as error:
-            rgbd_registry.load(path)
+            rgbd_registry.load_recording(path)
         message = str(error.value)
         assert message.startswith(f"{path}: expected a folder of ") and message.endswith(f", got {got}")
         assert "\n" not in message
@@ -92,7 +92,7 @@ def desk(tmp_path, walk, save):
 def test_a_format_that_is_named_is_taken(desk):
     touch(desk, ["rgb.txt"])
     assert rgbd_registry.find_format(desk) == "tum"
-    recording = rgbd_registry.load(desk, "plain", rate_hz=10.0)
+    recording = rgbd_registry.load_recording(desk, "plain", rate_hz=10.0)
     np.testing.assert_allclose(recording.t, np.arange(6) / 10)
     np.testing.assert_array_equal(recording.T_world_cam, plain.load(desk).T_world_cam)
 

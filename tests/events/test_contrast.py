@@ -82,7 +82,7 @@ def test_few_events_are_refused(steps):
 @pytest.mark.data
 @pytest.mark.slow
 def test_the_slider_of_a_real_recording(data_dir):
-    recording = event_registry.load(data_dir / "ecd_slider_depth")
+    recording = event_registry.load_events(data_dir / "ecd_slider_depth")
     slide = find_displacement(recording.camera, recording.events)
     first, last = recording.T_world_cam[[0, -1]]
     way = first[:3, :3].T @ (last[:3, 3] - first[:3, 3])

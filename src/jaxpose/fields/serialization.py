@@ -30,7 +30,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxpose import nn
-from jaxpose.fields import Params, PoseNetConfig
+from jaxpose.fields._posenet import PoseNetConfig
+from jaxpose.fields.types import Params
 from jaxpose.files.atomic import atomic
 from jaxpose.geometry import se3
 from jaxpose.geometry.rigid import Similarity

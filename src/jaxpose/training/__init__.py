@@ -1,1 +1,5 @@
 """Joint training of a scene and a pose field."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

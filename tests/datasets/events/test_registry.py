@@ -63,7 +63,7 @@ def test_made_archives_read_back(made):
     start = (OFFSET + raw["t"][0]) / 1e6
     np.testing.assert_allclose(recording.t, [49599.3 - start, 49599.4 - start], atol=1e-9)
     np.testing.assert_allclose(recording.T_world_cam[:, :3, 3], [[1, 2, 3], [2, 2, 3]])
-    again = event_registry.load(folder, mosaic="rggb", span=(0.05, 0.1))
+    again = event_registry.load_events(folder, mosaic="rggb", span=(0.05, 0.1))
     assert again.mosaic == "rggb" and 0.05 <= again.events.t[0] < again.events.t[-1] < 0.1
 
 
@@ -184,7 +184,7 @@ def test_formats_are_told_by_their_files(tmp_path):
     )
     for path, got in folders:
         with pytest.raises(DataError, match=f"{path}: expected a recording of events, .*got {got}$") as error:
-            event_registry.load(path)
+            event_registry.load_events(path)
         assert all(name in str(error.value) for name in ("eventnerf", "davis", "hdf5", "npz"))
 
 

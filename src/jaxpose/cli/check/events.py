@@ -38,7 +38,7 @@ def check_events(path: Path, form: event_registry.Format) -> tuple[str, Checked]
         parts += [_events(stream, tally, size), check_camera(camera), *_beside(stream.file.parent)]
         # EventNeRF's views are spread over all events, so there all are read.
         span = None if form == "eventnerf" else (tally.earliest, np.nextafter(tally.latest, np.inf))
-        parts.append(_recording(event_registry.load(path, form, span=span), form))
+        parts.append(_recording(event_registry.load_events(path, form, span=span), form))
     except (DataError, OSError) as error:
         parts.append(unusable(error))
     return name, join(parts)

@@ -35,7 +35,7 @@ def check_recording(path: Path, form: rgbd_registry.Format) -> Checked:
     if form == "euroc":
         parts.append(check_inertial(path))
     try:
-        recording = rgbd_registry.load(path, form)
+        recording = rgbd_registry.load_recording(path, form)
         parts += [
             Checked(notes=recording.notes),
             _frames(recording, _stamped(path, form)),

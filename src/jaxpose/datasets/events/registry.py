@@ -62,7 +62,7 @@ def find(path: Path | str, format: Format | None = None, *, size: tuple[int, int
     return _LAYOUTS[format or find_format(path)].module.find(path, size=size)
 
 
-def load(
+def load_events(
     path: Path | str,
     format: Format | None = None,
     *,

@@ -54,7 +54,7 @@ def find_format(path: Path | str) -> Format:
     raise DataError(f"{path}: expected a folder of {expected}, got {found(path)}")
 
 
-def load(path: Path | str, format: Format | None = None, *, rate_hz: float = 30.0) -> Recording:
+def load_recording(path: Path | str, format: Format | None = None, *, rate_hz: float = 30.0) -> Recording:
     """Read a recording in the layout `format`, or in the one that `find_format` finds.
 
     `rate_hz` is the frame rate where a layout has no timestamps. Errors as those of the loader.

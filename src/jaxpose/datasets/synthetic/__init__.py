@@ -1,5 +1,5 @@
-"""A room made on the fly, for tests and for a first run without data."""
+"""Recordings made on the fly, for tests and for a first run without data."""
 
-from jaxpose.datasets.synthetic.room_renderer import RoomConfig, room
+import lazy_loader
 
-__all__ = ["RoomConfig", "room"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -110,7 +110,7 @@ def read(config: Config) -> EventRecording:
         width = _SMOKE_WIDTH if config.smoke else config.image_width or _WIDTH
         poses = _SMOKE_POSES if config.smoke else 1000
         return event_orbit.event_orbit(width, config.seed, poses=poses, mosaic=config.mosaic or "rggb")
-    return event_registry.load(config.data, mosaic=config.mosaic)
+    return event_registry.load_events(config.data, mosaic=config.mosaic)
 
 
 def begin(config: Config, recording: EventRecording) -> Problem:

@@ -133,7 +133,7 @@ def load(options: Options) -> Source:
         imu = f"{options.room.imu_rate_hz:g} Hz, exact derivatives of the room's path, {_sheet(noise)}"
     else:
         name = rgbd_registry.find_format(options.data) if options.format in ("room", None) else options.format
-        recording = rgbd_registry.load(options.data, name, rate_hz=options.recorded_hz)
+        recording = rgbd_registry.load_recording(options.data, name, rate_hz=options.recorded_hz)
         if options.imu_file is not None and options.imu_extrinsics is not None:
             recording = with_imu(recording, options.imu_file, options.imu_extrinsics)
         imu, own_imu = "none", recording.imu is not None

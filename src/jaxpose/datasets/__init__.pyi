@@ -1,0 +1,15 @@
+from . import events as events
+from . import photos as photos
+from . import rgbd as rgbd
+from . import synthetic as synthetic
+from .events.registry import load_events as load_events
+from .rgbd.registry import load_recording as load_recording
+from .types import Accelerometer as Accelerometer
+from .types import EventRecording as EventRecording
+from .types import Frame as Frame
+from .types import Photographs as Photographs
+from .types import Recording as Recording
+from .types import every as every
+from .types import select as select
+from .types import take as take
+from .types import thin as thin

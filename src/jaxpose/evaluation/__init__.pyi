@@ -1,0 +1,16 @@
+from . import image_quality as image_quality
+from . import trajectory_error as trajectory_error
+from .image_quality import lpips as lpips
+from .image_quality import psnr as psnr
+from .image_quality import ssim as ssim
+from .trajectory_error import Ate as Ate
+from .trajectory_error import PoseErrors as PoseErrors
+from .trajectory_error import Rpe as Rpe
+from .trajectory_error import Statistics as Statistics
+from .trajectory_error import align as align
+from .trajectory_error import align_trajectory as align_trajectory
+from .trajectory_error import ate as ate
+from .trajectory_error import path_length as path_length
+from .trajectory_error import pose_errors as pose_errors
+from .trajectory_error import rpe as rpe
+from .trajectory_error import umeyama as umeyama

@@ -1,0 +1,14 @@
+from . import voxel_grid as voxel_grid
+from ._image import ImageConfig as ImageConfig
+from ._image import ImageField as ImageField
+from ._image import image as image
+from ._nerf import NerfConfig as NerfConfig
+from ._nerf import nerf as nerf
+from .types import SceneField as SceneField
+from .voxel_grid import GridConfig as GridConfig
+from .voxel_grid import bounding_grid as bounding_grid
+from .voxel_grid import grid as grid
+from .voxel_grid import grow as grow
+from .voxel_grid import merge as merge
+from .voxel_grid import node_positions as node_positions
+from .voxel_grid import node_shape as node_shape

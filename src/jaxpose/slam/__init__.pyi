@@ -1,0 +1,10 @@
+from . import checkpoint as checkpoint
+from . import config as config
+from . import map as map
+from . import tracking as tracking
+from .config import ImuMode as ImuMode
+from .config import SlamConfig as SlamConfig
+from .pipeline import Progress as Progress
+from .pipeline import SlamResult as SlamResult
+from .pipeline import run as run
+from .types import SlamState as SlamState

@@ -1,0 +1,15 @@
+from . import events as events
+from . import photometric as photometric
+from . import steps as steps
+from .events import EventData as EventData
+from .events import EventTrainConfig as EventTrainConfig
+from .photometric import Depths as Depths
+from .photometric import TrainConfig as TrainConfig
+from .photometric import Viewer as Viewer
+from .photometric import Views as Views
+from .photometric import viewer as viewer
+from .steps import Rate as Rate
+from .steps import State as State
+from .steps import Trainer as Trainer
+from .steps import joint as joint
+from .steps import microbatched_sum as microbatched_sum
