@@ -19,7 +19,7 @@ from timing import in_turn, machine, milliseconds
 from jaxpose.datasets.types import Frame
 from jaxpose.fields import PoseNetConfig, posenet
 from jaxpose.geometry import se3
-from jaxpose.geometry.camera import Camera
+from jaxpose.geometry.camera import Camera, pixel_grid, unproject_numpy
 from jaxpose.scenes import bounding_grid, grid, node_positions
 from jaxpose.slam.observation import SampleConfig, sample_pixels, to_device
 from jaxpose.slam.tracking.objective import TrackConfig, image_loss, image_residuals
@@ -49,9 +49,7 @@ def room() -> tuple:
     nodes = node_positions(config)
     distance = np.clip((HALF - np.abs(nodes)).min(axis=-1), -config.truncation, config.truncation)
     values = np.concatenate([distance[..., None], colour(nodes)], axis=-1)
-    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
-    x, y = (u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy
-    direction = np.stack([x, y, np.ones_like(x)], axis=-1)
+    direction = unproject_numpy(CAMERA, pixel_grid(CAMERA))
     depth = (HALF / np.maximum(np.abs(direction), 1e-9)).min(axis=-1)
     rgb = (255 * colour(depth[..., None] * direction)).astype(np.uint8)
     return grid(config), (jnp.asarray(values, jnp.float32),), to_device(Frame(rgb, depth))

@@ -13,6 +13,7 @@ if "PYTEST_XDIST_WORKER" not in os.environ:
 
 import jax
 import jax.numpy as jnp
+import jaxtyping
 import matplotlib
 import numpy as np
 import pytest
@@ -33,6 +34,14 @@ def dtype(request):
     else:
         with jax.enable_x64(True):
             yield jnp.float64
+
+
+@pytest.fixture
+def unchecked():
+    """Run the test as users run the library: arguments reach functions whose annotations they break."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 @pytest.fixture(scope="session")

@@ -32,7 +32,8 @@ def test_components_are_scipys_euler_angles_and_a_direction():
 
 
 def test_the_angle_of_view_is_from_edge_to_edge():
-    assert angle_of_view(Camera(320.0, 320.0, 319.5, 239.5, 640, 480)) == pytest.approx(np.pi / 2)
+    angles = angle_of_view(Camera(320.0, 320.0, 319.5, 239.5, 640, 480))
+    assert angles == pytest.approx((np.pi / 2, 2 * np.arctan(0.75)))
 
 
 @pytest.mark.parametrize(

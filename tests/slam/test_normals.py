@@ -27,11 +27,13 @@ def test_a_wall_is_its_own_plane_up_to_the_border(normal):
     assert_allclose(inner[..., 3], 1.4, atol=1e-3)
 
 
-def test_a_lens_that_distorts_bends_the_normal_by_little_and_the_point_stays():
-    camera = Camera(60.0, 60.0, 31.5, 23.5, 64, 48, (-0.1, 0.02, 0.0, 0.0))
+def test_a_wall_is_its_own_plane_through_a_lens_that_distorts():
+    """EuRoC's cam0 in small: without its distortion the normals would be off by 4 degrees in the median."""
+    camera = Camera(39.0, 45.7, 31.5, 23.5, 64, 48, (-0.283, 0.074, 0.0002, 0.00002))
     depth, unit = wall((0.3, -0.2, -1), 1.4, camera)
     found = planes(depth, camera)
-    assert (found[1:-1, 1:-1, :3] @ unit).min() > np.cos(np.deg2rad(6))
+    off = np.rad2deg(np.arccos(np.clip(found[1:-1, 1:-1, :3] @ unit, -1, 1)))
+    assert np.median(off) < 0.15 and off.max() < 1.5  # the window of the slopes is 9 pixels wide
     points = depth[..., None] * rays(camera)
     assert_allclose(np.sum(found[..., :3] * points, -1) + found[..., 3], 0, atol=1e-5)
 

@@ -13,7 +13,7 @@ from scipy.optimize import minimize
 
 from jaxpose.errors import DataError
 from jaxpose.events.types import Events
-from jaxpose.geometry.camera import Camera, pixel_direction
+from jaxpose.geometry.camera import Camera, project, unproject
 
 _LEAST = 100  # events
 _BLUR = np.exp(-0.5 * np.arange(-3, 4) ** 2) / np.sum(np.exp(-0.5 * np.arange(-3, 4) ** 2))  # sigma 1 px
@@ -33,7 +33,7 @@ class Displacement(NamedTuple):
 class Located(NamedTuple):
     """Events with where they look, for warping."""
 
-    direction: Float[Array, "n 2"]  # x and y at z = 1
+    direction: Float[Array, "n 3"]  # of length 1 along z
     t: Float[Array, " n"]  # [s] since the middle
     polarity: Float[Array, " n"]
 
@@ -42,8 +42,9 @@ def locate(camera: Camera, events: Events) -> Located:
     """Events on the plane z = 1, their lens undone, and their times from the middle of the span."""
     pixel = jnp.asarray(np.stack([events.x, events.y], -1), jnp.float32)
     t = events.t - (events.t[0] + events.t[-1]) / 2
-    direction = pixel_direction(camera, pixel)[:, :2]
-    return Located(direction, jnp.asarray(t, jnp.float32), jnp.asarray(events.polarity, jnp.float32))
+    return Located(
+        unproject(camera, pixel), jnp.asarray(t, jnp.float32), jnp.asarray(events.polarity, jnp.float32)
+    )
 
 
 def warped(
@@ -54,9 +55,8 @@ def warped(
     `inverse_depth` is each event's, `velocity` the camera's in its own axes, in the same unit per second. The
     image is a pinhole's of the same focal length.
     """
-    way = events.t * inverse_depth
-    at = (events.direction + way[:, None] * velocity[None, :2]) / (1 + velocity[2] * way)[:, None]
-    x, y = at[:, 0] * camera.fx + camera.cx, at[:, 1] * camera.fy + camera.cy
+    displacement = (events.t * inverse_depth)[:, None] * velocity[None]
+    x, y = project(_pinhole(camera), events.direction + displacement).T
     column, row = jnp.floor(x), jnp.floor(y)
     image = jnp.zeros((camera.height, camera.width), x.dtype)
     for right, below in ((0, 0), (0, 1), (1, 0), (1, 1)):
@@ -112,6 +112,11 @@ def find_displacement(camera: Camera, events: Events) -> Displacement:
     return Displacement(np.asarray(velocity, np.float64), np.asarray(inverse_depth, np.float64), contrast)
 
 
+def _pinhole(camera: Camera) -> Camera:
+    """The camera without its distortion."""
+    return camera._replace(distortion=())
+
+
 def _positive(log_inverse: Float[Array, "rows columns"]) -> Float[Array, "rows columns"]:
     """Inverse depths whose geometric mean is 1: together with velocity they have no scale."""
     return jnp.exp(log_inverse - log_inverse.mean())
@@ -120,8 +125,8 @@ def _positive(log_inverse: Float[Array, "rows columns"]) -> Float[Array, "rows c
 def _sampler(camera: Camera, events: Located):
     """A function from inverse depths on a grid over the image to those of the events, bilinear."""
     rows, columns = _GRID
-    x = (events.direction[:, 0] * camera.fx + camera.cx) / camera.width * (columns - 1)
-    y = (events.direction[:, 1] * camera.fy + camera.cy) / camera.height * (rows - 1)
+    x, y = project(_pinhole(camera), events.direction).T
+    x, y = x / camera.width * (columns - 1), y / camera.height * (rows - 1)
     x, y = jnp.clip(x, 0, columns - 1.001), jnp.clip(y, 0, rows - 1.001)
     column, row = jnp.floor(x), jnp.floor(y)
     right, below = x - column, y - row

@@ -1,10 +1,20 @@
-"""The pinhole camera with OpenCV's lens distortion: pixels to rays and points to pixels."""
+"""The pinhole camera with OpenCV's distortion: the only code that knows intrinsics and distortion.
+
+`project` and `unproject` are for JAX; `project_numpy` and `unproject_numpy` are the same formulas in float64
+numpy. Model and coefficients are those of OpenCV's `calib3d` documentation (Brown 1971): with x = X / Z,
+y = Y / Z and r2 = x^2 + y^2 the distorted point is
+
+    x' = x (1 + k1 r2 + k2 r2^2 + k3 r2^3) + 2 p1 x y + p2 (r2 + 2 x^2)
+    y' = y (1 + k1 r2 + k2 r2^2 + k3 r2^3) + p1 (r2 + 2 y^2) + 2 p2 x y
+
+and the pixel is (fx x' + cx, fy y' + cy).
+"""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 Scalar = float | Float[Array, ""]  # traced where a caller optimises the intrinsics
@@ -13,9 +23,16 @@ _OUTSIDE = -1e6  # [px] where points without a pixel go: outside every image, an
 
 
 class Camera(NamedTuple):
-    """Intrinsics [px], plain Python numbers; the centre of the first pixel is (0, 0), as in OpenCV.
+    """Intrinsics of a pinhole camera with distortion.
 
-    `distortion` is OpenCV's k1 k2 p1 p2 [k3]; empty for a pinhole, which then pays nothing for it.
+    Attributes:
+        fx: Focal length along the rows [px].
+        fy: Focal length along the columns [px].
+        cx: Column of the principal point [px]; the centre of the first pixel is (0, 0), as in OpenCV.
+        cy: Row of the principal point [px].
+        width: Columns of the image.
+        height: Rows of the image.
+        distortion: OpenCV's k1 k2 p1 p2 [k3]; empty for a pinhole, which then pays nothing for it.
     """
 
     fx: float
@@ -27,46 +44,127 @@ class Camera(NamedTuple):
     distortion: tuple[float, ...] = ()
 
 
-def pixel_direction(camera: Camera, pixel: Float[Array, "*n 2"]) -> Float[Array, "*n 3"]:
-    """The ray through a pixel (u, v) in camera axes, of length 1 along z: depth times it is the point."""
-    distorted = jnp.stack(
-        [(pixel[..., 0] - camera.cx) / camera.fx, (pixel[..., 1] - camera.cy) / camera.fy], axis=-1
-    )
-    point = _undistort(camera.distortion, distorted)
-    return jnp.concatenate([point, jnp.ones_like(point[..., :1])], axis=-1)
-
-
 def project(camera: Camera, point_cam: Float[Array, "*n 3"]) -> Float[Array, "*n 2"]:
-    """The pixel (u, v) of a point in camera axes.
+    """The pixel (u, v) of points in camera axes; differentiable, for any leading axes.
 
-    A point behind the camera (or within 0.06 degrees of the plane through it) has no pixel: it goes to
-    (-1e6, -1e6), outside every image, with zero gradient. A lens polynomial holds within the image it was
-    calibrated on; far outside it may fold points back, so bound the angle of points before they come here.
+    A point that the camera cannot see has no pixel: it goes to (-1e6, -1e6), outside every image, with zero
+    gradient. That is one behind the camera (or within 0.06 degrees of the plane through it), and one so far
+    from the optical axis that the radial polynomial falls there, which would fold it back into the image.
+
+    Args:
+        camera: The camera; its intrinsics may be traced.
+        point_cam: Points (x right, y down, z forward), any unit of length.
+
+    Returns:
+        Pixels (column, row) [px].
+
+    Raises:
+        ValueError: For points without 3 coordinates, and for a distortion of other than 0, 4 or 5 numbers.
+
+    >>> camera = Camera(500.0, 500.0, 320.0, 240.0, 640, 480)
+    >>> project(camera, jnp.array([0.1, 0.0, 1.0])).tolist()
+    [370.0, 240.0]
     """
-    xy, z = point_cam[..., :2], point_cam[..., 2:]
-    seen = z > 1e-3 * jnp.max(jnp.abs(xy), axis=-1, keepdims=True)
-    distorted = _distort(camera.distortion, jnp.where(seen, xy, 0) / jnp.where(seen, z, 1))
-    pixel = jnp.stack(
-        [distorted[..., 0] * camera.fx + camera.cx, distorted[..., 1] * camera.fy + camera.cy], axis=-1
-    )
-    return jnp.where(seen, pixel, _OUTSIDE)
+    return _project(jnp, camera, point_cam)
 
 
-def angle_of_view(camera: Camera) -> float:
-    """The horizontal angle of view [rad] of the pinhole."""
-    return 2 * math.atan(camera.width / 2 / camera.fx)
+def unproject(camera: Camera, pixel: Float[Array, "*n 2"]) -> Float[Array, "*n 3"]:
+    """The ray through a pixel in camera axes, of length 1 along z: depth times it is the point.
+
+    The inverse of `project`: the distortion is undone by six steps of Newton's method, which reach rounding
+    within the image of the lenses of EuRoC and TUM.
+
+    Args:
+        camera: The camera; its intrinsics may be traced.
+        pixel: Pixels (column, row) [px], fractions allowed.
+
+    Returns:
+        Directions (x, y, 1).
+
+    Raises:
+        ValueError: For pixels without 2 coordinates, and for a distortion of other than 0, 4 or 5 numbers.
+
+    >>> camera = Camera(500.0, 500.0, 320.0, 240.0, 640, 480)
+    >>> unproject(camera, jnp.array([820.0, 240.0])).tolist()
+    [1.0, 0.0, 1.0]
+    """
+    return _unproject(jnp, camera, pixel)
+
+
+def pixel_slopes(camera: Camera, direction_cam: Float[Array, "*n 3"]) -> Float[Array, "*n 2 2"]:
+    """How a pixel moves with its ray: derivatives of (u, v) by x and y at z = 1, where `project` sees it.
+
+    Args:
+        camera: The camera; its intrinsics may be traced.
+        direction_cam: Directions (x, y, 1), as `unproject` gives them.
+
+    Returns:
+        Rows u and v, columns x and y [px].
+    """
+    xx = yy = jnp.ones_like(direction_cam[..., 0])
+    xy = jnp.zeros_like(xx)
+    if camera.distortion:
+        _, (xx, xy, yy) = _distort(jnp, camera.distortion, direction_cam[..., :2])
+    rows = [camera.fx * xx, camera.fx * xy, camera.fy * xy, camera.fy * yy]
+    return jnp.stack(rows, axis=-1).reshape(*xx.shape, 2, 2)
+
+
+def project_numpy(camera: Camera, point_cam: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 2"]:
+    """`project` in float64 numpy."""
+    return _project(np, camera, np.asarray(point_cam, np.float64))
+
+
+def unproject_numpy(camera: Camera, pixel: np.ndarray) -> Float[np.ndarray, "*n 3"]:
+    """`unproject` in float64 numpy; pixels of any number type."""
+    return _unproject(np, camera, np.asarray(pixel, np.float64))
+
+
+def pixel_grid(camera: Camera, step: int = 1) -> np.ndarray:
+    """Pixels (column, row) of the image: the middle of every block of `step` x `step`.
+
+    Returns:
+        Whole numbers (rows, columns, 2), float64.
+
+    >>> pixel_grid(Camera(1.0, 1.0, 0.0, 0.0, 4, 2), 2).tolist()
+    [[[1.0, 1.0], [3.0, 1.0]]]
+    """
+    row, column = np.mgrid[step // 2 : camera.height : step, step // 2 : camera.width : step]
+    return np.stack([column, row], axis=-1).astype(np.float64)
+
+
+def angle_of_view(camera: Camera) -> tuple[float, float]:
+    """The horizontal and the vertical angle of view [rad] of the pinhole, its distortion left out.
+
+    >>> round(math.degrees(angle_of_view(Camera(320.0, 320.0, 319.5, 239.5, 640, 480))[0]), 6)
+    90.0
+    """
+    return 2 * math.atan(camera.width / 2 / camera.fx), 2 * math.atan(camera.height / 2 / camera.fy)
 
 
 def scale(camera: Camera, factor: float) -> Camera:
     """The camera of the image resized by `factor` (0.5: half as wide), its size rounded to whole pixels.
 
     Resizing keeps the image's outer edge, half a pixel outside the first centre: u' = (u + 0.5) s - 0.5.
+
+    Raises:
+        ValueError: For a factor that leaves no pixel.
+
+    >>> scale(Camera(500.0, 500.0, 319.5, 239.5, 640, 480), 0.5)[:6]
+    (250.0, 250.0, 159.5, 119.5, 320, 240)
     """
+    if not 0 < factor < math.inf:
+        raise ValueError(f"factor: expected a positive number, got {factor}")
     return resized(camera, round(camera.width * factor), round(camera.height * factor))
 
 
 def resized(camera: Camera, width: int, height: int) -> Camera:
-    """The camera of the image resized to exactly this size, as `scale` says."""
+    """The camera of the image resized to exactly this size, as `scale` says.
+
+    Raises:
+        ValueError: For a size below one pixel.
+    """
+    if width < 1 or height < 1:
+        raise ValueError(f"size: expected at least 1x1 pixels, got {width}x{height}")
     sx, sy = width / camera.width, height / camera.height
     return camera._replace(
         fx=camera.fx * sx,
@@ -78,42 +176,68 @@ def resized(camera: Camera, width: int, height: int) -> Camera:
     )
 
 
-def _distort(distortion: tuple[Scalar, ...], point: Float[Array, "*n 2"]) -> Float[Array, "*n 2"]:
-    """Where the lens puts an ideal image point at z = 1; raises ValueError unless 0, 4 or 5 coefficients."""
-    if not distortion:
-        return point
+# What follows is written once for both libraries: `xp` is numpy or jax.numpy.
+
+
+def _project(xp: Any, camera: Camera, point_cam: Any) -> Any:
+    if point_cam.shape[-1:] != (3,):
+        raise ValueError(f"point_cam: expected 3 coordinates (..., 3), got shape {point_cam.shape}")
+    xy, z = point_cam[..., :2], point_cam[..., 2:]
+    seen = z > 1e-3 * xp.max(xp.abs(xy), axis=-1, keepdims=True)
+    point = xp.where(seen, xy, 0) / xp.where(seen, z, 1)
+    if camera.distortion:
+        r2 = xp.sum(point * point, axis=-1, keepdims=True)
+        seen = seen & (r2 < _turning_point(xp, camera.distortion, r2.dtype))
+        point = _distort(xp, camera.distortion, xp.where(seen, point, 0))[0]
+    pixel = xp.stack([point[..., 0] * camera.fx + camera.cx, point[..., 1] * camera.fy + camera.cy], axis=-1)
+    return xp.where(seen, pixel, _OUTSIDE)
+
+
+def _unproject(xp: Any, camera: Camera, pixel: Any) -> Any:
+    if pixel.shape[-1:] != (2,):
+        raise ValueError(f"pixel: expected 2 coordinates (..., 2), got shape {pixel.shape}")
+    distorted = xp.stack(
+        [(pixel[..., 0] - camera.cx) / camera.fx, (pixel[..., 1] - camera.cy) / camera.fy], axis=-1
+    )
+    point = distorted
+    for _ in range(_NEWTON_STEPS if camera.distortion else 0):
+        value, (xx, xy, yy) = _distort(xp, camera.distortion, point)
+        x, y = (value - distorted)[..., 0], (value - distorted)[..., 1]
+        step = xp.stack([yy * x - xy * y, xx * y - xy * x], axis=-1) / (xx * yy - xy * xy)[..., None]
+        point = point - step
+    return xp.concatenate([point, xp.ones_like(point[..., :1])], axis=-1)
+
+
+def _coefficients(distortion: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
+    """k1 k2 p1 p2 k3; raises ValueError unless 4 or 5 coefficients."""
     if len(distortion) not in (4, 5):
         raise ValueError(f"distortion: expected k1 k2 p1 p2 [k3] or nothing, got {len(distortion)} numbers")
-    k1, k2, p1, p2, k3 = (*distortion, 0.0)[:5]
+    return (*distortion, 0.0)[:5]
+
+
+def _distort(xp: Any, distortion: tuple[Scalar, ...], point: Any) -> tuple[Any, tuple[Any, Any, Any]]:
+    """The distorted point at z = 1, and its derivatives: x' by x, x' by y (the same as y' by x), y' by y."""
+    k1, k2, p1, p2, k3 = _coefficients(distortion)
     x, y = point[..., 0], point[..., 1]
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    return jnp.stack(
+    slope = 2 * (k1 + r2 * (2 * k2 + r2 * (3 * k3)))  # of `radial` by r2, twice
+    value = xp.stack(
         [
             x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
             y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
         ],
         axis=-1,
     )
+    by_xx = radial + x * x * slope + 2 * p1 * y + 6 * p2 * x
+    by_xy = x * y * slope + 2 * p1 * x + 2 * p2 * y
+    by_yy = radial + y * y * slope + 6 * p1 * y + 2 * p2 * x
+    return value, (by_xx, by_xy, by_yy)
 
 
-def _undistort(distortion: tuple[Scalar, ...], distorted: Float[Array, "*n 2"]) -> Float[Array, "*n 2"]:
-    """The inverse of `_distort` by Newton's method, a fixed number of steps."""
-    if not distortion:
-        return distorted
-    point = distorted
-    unit_x = jnp.broadcast_to(jnp.asarray([1, 0], point.dtype), point.shape)
-    for _ in range(_NEWTON_STEPS):
-        value, by_x = jax.jvp(lambda p: _distort(distortion, p), (point,), (unit_x,))
-        by_y = jax.jvp(lambda p: _distort(distortion, p), (point,), (1 - unit_x,))[1]
-        residual = value - distorted
-        determinant = by_x[..., 0] * by_y[..., 1] - by_x[..., 1] * by_y[..., 0]
-        step = jnp.stack(
-            [
-                residual[..., 0] * by_y[..., 1] - residual[..., 1] * by_y[..., 0],
-                residual[..., 1] * by_x[..., 0] - residual[..., 0] * by_x[..., 1],
-            ],
-            axis=-1,
-        )
-        point = point - step / determinant[..., None]
-    return point
+def _turning_point(xp: Any, distortion: tuple[Scalar, ...], dtype: Any) -> Any:
+    """The squared radius at which the distorted radius stops growing; infinite if not within 76 degrees."""
+    k1, k2, _, _, k3 = _coefficients(distortion)
+    r2 = xp.linspace(0.0625, 16, 256, dtype=dtype)
+    falls = 1 + r2 * (3 * k1 + r2 * (5 * k2 + r2 * (7 * k3))) <= 0
+    return xp.where(xp.any(falls), r2[xp.argmax(falls)], math.inf)

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxpose.datasets.types import Frame, Recording
-from jaxpose.geometry.camera import Camera
+from jaxpose.geometry.camera import Camera, project_numpy
 from jaxpose.slam.observation import Image, to_device
 
 
@@ -47,15 +47,13 @@ def overlap(
 ) -> np.ndarray:
     """Share (k,) of world points (n, 3) that each of the cameras (k, 4, 4) sees (NICE-SLAM's test).
 
-    The lens' distortion is left out, which is exact enough for a share.
+    A point counts that is at least `margin` pixels inside the image.
     """
     T_cam_world = np.linalg.inv(T_world_cam)
     points = np.einsum("kij,nj->kni", T_cam_world[:, :3, :3], points_world) + T_cam_world[:, None, :3, 3]
-    z = np.maximum(points[..., 2], 1e-6)
-    u = points[..., 0] / z * camera.fx + camera.cx
-    v = points[..., 1] / z * camera.fy + camera.cy
+    u, v = np.moveaxis(project_numpy(camera, points), -1, 0)
     inside = (u >= margin) & (u < camera.width - margin) & (v >= margin) & (v < camera.height - margin)
-    return np.mean(inside & (points[..., 2] > 0), axis=1)
+    return np.mean(inside, axis=1)
 
 
 def choose(shares: np.ndarray, count: int, generator: np.random.Generator) -> list[int]:

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt8
 from jaxpose import render
 from jaxpose.datasets.types import Frame
 from jaxpose.geometry import se3
-from jaxpose.geometry.camera import Camera, pixel_direction, project
+from jaxpose.geometry.camera import Camera, project, unproject
 from jaxpose.render import Query, Ray, Rendered
 
 _BLANK = 3.0  # [grey levels] spread of an image that is black or saturated
@@ -80,7 +80,7 @@ def read_pixels(image: Image, camera: Camera, row: Int[Array, " n"], column: Int
     """The named pixels of an image."""
     pixel = jnp.stack([column, row], axis=-1).astype(jnp.float32)
     rgb = image.rgb[row, column].astype(jnp.float32) / 255
-    return Pixels(pixel_direction(camera, pixel), image.depth[row, column], rgb * image.exposure[None])
+    return Pixels(unproject(camera, pixel), image.depth[row, column], rgb * image.exposure[None])
 
 
 def sample_depths(depth: Float[Array, ""], far: Float[Array, ""], config: SampleConfig) -> Float[Array, " s"]:

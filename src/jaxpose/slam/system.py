@@ -42,7 +42,7 @@ def make_system(recording: Recording, config: SlamConfig) -> System:
     readings = _readings(recording, config)
     t = recording.t
     framed = make_field(config.frame, config.field, float(np.median(np.diff(t))), float(t[-1] - t[0]))
-    view = angle_of_view(recording.camera)
+    view = angle_of_view(recording.camera)[0]
     field_update = make_field_update(
         framed, config.track, IMU_WEIGHTS[config.imu], _sigmas(recording, config), view
     )

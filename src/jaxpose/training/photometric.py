@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt8
 from jaxpose import render
 from jaxpose.fields import PoseField
 from jaxpose.geometry import se3
-from jaxpose.geometry.camera import Camera, pixel_direction
+from jaxpose.geometry.camera import Camera, unproject
 from jaxpose.render import Ray, Spacing
 from jaxpose.scenes import SceneField
 from jaxpose.training.steps import Trainer, joint, microbatched_sum
@@ -183,7 +183,7 @@ def ray_colour(
 def pixel_ray(camera: Camera, T_world_cam: Float[Array, "4 4"], x: Int[Array, ""], y: Int[Array, ""]) -> Ray:
     """The ray through a pixel, its direction of length 1 along the optical axis."""
     pixel = jnp.stack([x, y]).astype(T_world_cam.dtype)
-    direction = jnp.matmul(T_world_cam[:3, :3], pixel_direction(camera, pixel), precision="highest")
+    direction = jnp.matmul(T_world_cam[:3, :3], unproject(camera, pixel), precision="highest")
     return Ray(T_world_cam[:3, 3], direction)
 
 

@@ -174,7 +174,7 @@ def test_resizing_averages_areas_on_white_and_keeps_directions(tmp_path):
     edges = jnp.asarray([[-0.5, -0.5], [W - 0.5, H - 0.5]])
     half = jnp.asarray([[-0.5, -0.5], [W / 2 - 0.5, H / 2 - 0.5]])
     np.testing.assert_allclose(
-        camera.pixel_direction(full.camera, edges), camera.pixel_direction(small.camera, half), rtol=1e-6
+        camera.unproject(full.camera, edges), camera.unproject(small.camera, half), rtol=1e-6
     )
 
 

@@ -3,6 +3,7 @@
 Files of timestamps, camera, depth, ground truth, and what of it fits together.
 """
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from jaxpose.cli.check.timestamps import check_stamps, read_table
 from jaxpose.datasets.rgbd import registry as rgbd_registry
 from jaxpose.datasets.types import Recording
 from jaxpose.errors import DataError
-from jaxpose.geometry.camera import Camera
+from jaxpose.geometry.camera import Camera, angle_of_view
 
 _STAMPS = {"tum": ("rgb.txt", "depth.txt", "groundtruth.txt"), "plain": ("times.txt",)}
 _LOOKED_AT = 5  # depth images
@@ -51,10 +52,7 @@ def check_recording(path: Path, form: rgbd_registry.Format) -> Checked:
 def check_camera(camera: Camera) -> Checked:
     """Resolution, field of view, and whether the intrinsics are those of a camera with such images."""
     width, height = camera.width, camera.height
-    angles = [
-        float(np.degrees(2 * np.arctan(size / (2 * focal))))
-        for size, focal in ((width, camera.fx), (height, camera.fy))
-    ]
+    angles = [math.degrees(angle) for angle in angle_of_view(camera)]
     off = max(abs((camera.cx + 0.5) / width - 0.5), abs((camera.cy + 0.5) / height - 0.5))
     intrinsics = f"fx fy cx cy {' '.join(f'{x:.5g}' for x in camera[:4])}"
     lens = f", lens {' '.join(f'{x:.4g}' for x in camera.distortion)}" if camera.distortion else ""

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxpose.datasets.types import Recording
+from jaxpose.geometry.camera import pixel_grid, project_numpy, unproject_numpy
 from jaxpose.geometry.rigid import rotation_angle_deg
 
 _ANCHORS = 8
@@ -27,19 +28,14 @@ class Views(NamedTuple):
 
 def look(recording: Recording) -> Views | None:
     """Pairs over the whole recording; None if it has no two true poses."""
-    import jax
-    import jax.numpy as jnp
-
-    from jaxpose.geometry import camera as lens
-
     pairs = [] if recording.T_world_cam is None else _pairs(recording.T_world_cam)
     if not pairs:
         return None
     camera = recording.camera
     step = max(1, camera.width // _COLUMNS)
-    v, u = np.mgrid[0 : camera.height : step, 0 : camera.width : step].reshape(2, -1)
-    rays = np.asarray(lens.pixel_direction(camera, jnp.asarray(np.stack([u, v], -1), jnp.float32)))
-    project = jax.jit(partial(lens.project, camera))
+    pixel = pixel_grid(camera, step).reshape(-1, 2)
+    u, v = pixel.astype(int).T
+    rays = unproject_numpy(camera, pixel)
     depth = {i: recording.read(i).depth for i in sorted({i for pair in pairs for i in pair})}
     near = [depth[i][v, u] for i, _ in pairs]
     return Views(
@@ -47,7 +43,7 @@ def look(recording: Recording) -> Views | None:
         [rays * z[:, None] for z in near],
         [z > 0 for z in near],
         [depth[j] for _, j in pairs],
-        lambda points: np.asarray(project(jnp.asarray(points, jnp.float32))),
+        partial(project_numpy, camera),
     )
 
 

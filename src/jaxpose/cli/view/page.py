@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from jaxpose.cli.view.scene import WIDTH, Picture, Scene
 from jaxpose.errors import DataError
 from jaxpose.files.atomic import atomic
+from jaxpose.geometry.camera import angle_of_view
 
 _SAVED_FRAMES = 100  # of the camera on its way in a saved file, at most
 _ESTIMATE, _TRUTH, _KEYFRAME, _CAMERA = (31, 119, 180), (214, 39, 40), (255, 127, 14), (44, 160, 44)
@@ -93,7 +94,7 @@ def _draw(server: viser.ViserServer, scene: Scene, picture: Picture | None) -> A
             point_shape="circle",
             precision="float32",
         )
-    fov = 2 * float(np.arctan2(scene.camera.height / 2, scene.camera.fy))
+    fov = angle_of_view(scene.camera)[1]
     aspect = scene.camera.width / scene.camera.height
     add.add_frame("/frames", show_axes=False)
     for number, shot in enumerate(scene.shots):

@@ -9,13 +9,12 @@ from jaxtyping import Array, Float
 from scipy.ndimage import distance_transform_edt, minimum_filter
 
 from jaxpose.geometry import se3
-from jaxpose.geometry.camera import Camera, pixel_direction, project
+from jaxpose.geometry.camera import Camera, project
 
 _WINDOW = 9  # [px] wide: within it the nearest point hides those behind it
 _BEHIND = 0.1  # share of its depth by which a point must be farther to be hidden; slanted floors are not
 _REACH = 20.0  # [px] a gap is filled from; wider ones, such as open windows, stay without depth
 _NEAREST = 0.05  # [m]
-_BEYOND = 1.1  # of the image's widest angle (tangent), where points are no longer projected
 
 
 def depth_from_cloud(
@@ -27,19 +26,13 @@ def depth_from_cloud(
     sparser than an image, so walls show through what stands before them: a point is hidden if another within
     4 pixels is nearer by more than a tenth.
     """
-    corners = jnp.asarray(
-        [[u, v] for u in (0, camera.width - 1) for v in (0, camera.height - 1)], jnp.float32
-    )
-    widest = _BEYOND * float(jnp.linalg.norm(pixel_direction(camera, corners)[:, :2], axis=1).max())
     points = jnp.asarray(points_world, jnp.float32)
 
     @jax.jit
     def look(T_cam_world: Float[Array, "4 4"]) -> tuple[Float[Array, "n 2"], Float[Array, " n"]]:
         point_cam = se3.apply(T_cam_world[None], points)
         z = point_cam[:, 2]
-        # A lens polynomial may fold back what lies far outside the image.
-        seen = (z > _NEAREST) & (jnp.linalg.norm(point_cam[:, :2], axis=1) < widest * z)
-        return project(camera, jnp.where(seen[:, None], point_cam, -1)), z
+        return project(camera, jnp.where(z[:, None] > _NEAREST, point_cam, -1)), z
 
     def depth(T_world_cam: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "h w"]:
         pixel, z = (np.asarray(x) for x in look(jnp.asarray(np.linalg.inv(T_world_cam), jnp.float32)))

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxpose.datasets.types import Photographs
-from jaxpose.geometry.camera import Camera, pixel_direction
+from jaxpose.geometry.camera import Camera, unproject
 
 DIAMETER = 8.0  # of the circle [scene units]; the object lies within 1.7 of its centre
 FIELD_OF_VIEW_DEG = 40.0
@@ -89,7 +89,7 @@ def image(
     x = (np.arange(camera.width)[:, None] + offsets).ravel()
     y = (np.arange(camera.height)[:, None] + offsets).ravel()
     pixels = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    direction = pixel_direction(camera, jnp.asarray(pixels, jnp.float32))
+    direction = unproject(camera, jnp.asarray(pixels, jnp.float32))
     direction = jnp.matmul(direction, T_world_cam[:3, :3].T, precision="highest")
     direction = direction / jnp.linalg.norm(direction, axis=-1, keepdims=True)
     rgb = jax.vmap(partial(_trace, paint, background, T_world_cam[:3, 3]))(direction)

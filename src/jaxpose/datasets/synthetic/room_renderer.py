@@ -18,7 +18,7 @@ from jaxpose.datasets.synthetic.furniture import Extent, furnish
 from jaxpose.datasets.synthetic.shapes import Shapes, cast, locate, within_cone
 from jaxpose.datasets.synthetic.trajectory import Motion, by_hand, recorded
 from jaxpose.datasets.types import Frame, Recording
-from jaxpose.geometry.camera import Camera, pixel_direction
+from jaxpose.geometry.camera import Camera, unproject
 from jaxpose.imu import ADIS16448, GRAVITY_WORLD, ImuNoise
 
 
@@ -110,7 +110,7 @@ def render(
     coordinates = lambda n, first: jnp.arange(n, dtype=jnp.float32) + jnp.float32(first)
     centres = jnp.stack(jnp.meshgrid(coordinates(w, 0), coordinates(h, 0)), -1).reshape(-1, 2)
     corners = jnp.stack(jnp.meshgrid(coordinates(w + 1, -0.5), coordinates(h + 1, -0.5)), -1).reshape(-1, 2)
-    x, y, z = pixel_direction(camera, jnp.concatenate([centres, corners])).T
+    x, y, z = unproject(camera, jnp.concatenate([centres, corners])).T
     right, down, forwards, eye = T_world_cam[:3].T
     ray = tuple(right[k] * x + down[k] * y + forwards[k] * z for k in range(3))
     origin = tuple(eye[:, None])

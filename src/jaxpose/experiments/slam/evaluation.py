@@ -97,7 +97,7 @@ def freedom(recording: Recording, result: SlamResult) -> Freedom | None:
     if not np.isfinite(result.T_inner[1:]).all():
         return None
     T_world_body = result.T_world_cam @ np.linalg.inv(recording.T_body_cam)
-    view = angle_of_view(recording.camera)
+    view = angle_of_view(recording.camera)[0]
     motions = (np.linalg.inv(T_world_body[:-1]) @ T_world_body[1:], result.T_inner[1:])
     before, after = (np.asarray(effective_dof(jnp.asarray(motion, jnp.float32), view)) for motion in motions)
     numbers = {"threshold": THRESHOLD, "before_mean": float(before.mean()), "after_mean": float(after.mean())}

@@ -17,7 +17,7 @@ from jaxpose.errors import DataError
 from jaxpose.evaluation import image_quality
 from jaxpose.files import atomic
 from jaxpose.geometry import se3
-from jaxpose.geometry.camera import Camera, pixel_direction
+from jaxpose.geometry.camera import Camera, unproject
 from jaxpose.plots.slam import View
 from jaxpose.scenes import GridConfig, SceneField
 from jaxpose.slam.map.texture import Texture
@@ -131,7 +131,7 @@ def viewer(scene: SceneField, grid: GridConfig, camera: Camera) -> Viewer:
     @jax.jit
     def render(params, T_world_cam: Float[Array, "4 4"], pixel: Float[Array, "n 2"]):
         query, far = partial(scene.query, params), jnp.float32(reach)
-        direction = pixel_direction(camera, pixel)
+        direction = unproject(camera, pixel)
 
         def behind(direction):
             points = se3.apply(T_world_cam, depths[:, None] * direction[None])

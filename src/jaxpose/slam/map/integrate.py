@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxpose.geometry import se3
-from jaxpose.geometry.camera import Camera, pixel_direction
+from jaxpose.geometry.camera import Camera, unproject_numpy
 from jaxpose.scenes import GridConfig, SceneField, node_shape
 from jaxpose.scenes.types import Params
 from jaxpose.scenes.voxel_grid import trilinear
@@ -131,7 +131,7 @@ def _integrated(
 def _cone(camera: Camera) -> Callable[[Float[Array, "m 8 3"], Float[Array, ""]], Bool[Array, " m"]]:
     """A test of whether a box, by its corners in camera axes, may be in view and nearer than a depth."""
     column, row = np.meshgrid(np.arange(-1, camera.width + 1), np.arange(-1, camera.height + 1))
-    rays = np.asarray(pixel_direction(camera, jnp.asarray(np.stack([column, row], axis=-1), jnp.float32)))
+    rays = unproject_numpy(camera, np.stack([column, row], axis=-1))
     (left, top), (right, bottom) = rays[..., :2].min(axis=(0, 1)), rays[..., :2].max(axis=(0, 1))
 
     def in_view(corners, farthest):

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxpose.geometry.camera import Camera, pixel_direction
+from jaxpose.geometry.camera import Camera, pixel_grid, pixel_slopes, unproject
 from jaxpose.slam.observation import Image, Located, depth_sigma
 
 _RADIUS = 4  # [px] of the window that slopes are measured in
@@ -56,10 +56,10 @@ def seen_by(image: Image, camera: Camera) -> Callable[[Located], SurfaceObservat
 def tangent_planes(depth: Float[Array, "h w"], camera: Camera) -> Float[Array, "h w 4"]:
     """Planes n . x + d = 0 in camera axes [m] through the measured points, as (n, d), n towards the camera.
 
-    A plane's inverse depth is linear in the pixel. Its slopes are least-squares ones over pairs of pixels
-    opposite each other; a pair counts where the middle between the two is the depth of the pixel there, so
-    that no slope is taken across an edge. Where there is no such pair, or the surface is seen at a grazing
-    angle, the plane is the one across the optical axis, n = (0, 0, -1).
+    A plane's inverse depth is linear in x and y at z = 1. Its slopes are least-squares ones over pairs of
+    pixels opposite each other; a pair counts where the middle between the two is the depth of the pixel
+    there, so that no slope is taken across an edge. Where there is no such pair, or the surface is seen at a
+    grazing angle, the plane is the one across the optical axis, n = (0, 0, -1).
     """
     direction = _directions(camera)
     seen = depth > 0
@@ -67,7 +67,8 @@ def tangent_planes(depth: Float[Array, "h w"], camera: Camera) -> Float[Array, "
     near = _SAME_SURFACE * depth_sigma(depth) * inverse**2
     by_x, known_x = _slope(inverse, near, axis=1)
     by_y, known_y = _slope(inverse, near, axis=0)
-    x, y = by_x * camera.fx, by_y * camera.fy
+    slopes = pixel_slopes(camera, direction)
+    x, y = (by_x * slopes[..., 0, k] + by_y * slopes[..., 1, k] for k in range(2))
     along = -jnp.stack([x, y, inverse - x * direction[..., 0] - y * direction[..., 1]], axis=-1)
     normal = along / jnp.maximum(jnp.linalg.norm(along, axis=-1, keepdims=True), 1e-9)
     point = depth[..., None] * direction
@@ -78,8 +79,7 @@ def tangent_planes(depth: Float[Array, "h w"], camera: Camera) -> Float[Array, "
 
 def _directions(camera: Camera) -> Float[Array, "h w 3"]:
     """The rays of all pixels in camera axes (z = 1)."""
-    column, row = jnp.meshgrid(jnp.arange(camera.width), jnp.arange(camera.height))
-    return pixel_direction(camera, jnp.stack([column, row], axis=-1).astype(jnp.float32))
+    return unproject(camera, jnp.asarray(pixel_grid(camera), jnp.float32))
 
 
 def _cosine(normal: Float[Array, "h w 3"], direction: Float[Array, "h w 3"]) -> Float[Array, "h w"]:

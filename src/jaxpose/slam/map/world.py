@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxpose.datasets.types import Frame, Recording
+from jaxpose.geometry.camera import pixel_grid, unproject_numpy
 from jaxpose.scenes import GridConfig, SceneField, bounding_grid, grid, grow, merge
 from jaxpose.scenes.types import Params
 from jaxpose.slam.config import SlamConfig
@@ -72,12 +73,10 @@ def seen_points(
     frame: Frame, recording: Recording, T_world_cam: Float[np.ndarray, "4 4"], *, step: int = 16
 ) -> Float[np.ndarray, "n 3"]:
     """World points of every `step`-th pixel in both directions that has depth, float64."""
-    camera = recording.camera
-    row, column = np.mgrid[step // 2 : camera.height : step, step // 2 : camera.width : step]
-    depth = frame.depth[row, column]
+    pixel = pixel_grid(recording.camera, step)
+    depth = frame.depth[step // 2 :: step, step // 2 :: step]
     seen = depth > 0
-    ray = np.stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy, np.ones(row.shape)], -1)
-    points = ray[seen] * depth[seen][:, None]
+    points = unproject_numpy(recording.camera, pixel[seen]) * depth[seen][:, None]
     return points @ T_world_cam[:3, :3].T + T_world_cam[:3, 3]
 
 
