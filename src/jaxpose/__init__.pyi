@@ -26,9 +26,9 @@ from .fields import piecewise_geodesic as piecewise_geodesic
 from .fields import posenet as posenet
 from .fields import table as table
 from .geometry import Camera as Camera
-from .geometry import pixel_direction as pixel_direction
 from .geometry import project as project
 from .geometry import se3 as se3
+from .geometry import unproject as unproject
 from .imu import Imu as Imu
 from .imu import ImuNoise as ImuNoise
 from .imu import imu_residuals as imu_residuals

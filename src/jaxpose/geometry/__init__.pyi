@@ -3,8 +3,8 @@ from . import rigid as rigid
 from . import se3 as se3
 from .camera import Camera as Camera
 from .camera import angle_of_view as angle_of_view
-from .camera import pixel_direction as pixel_direction
 from .camera import project as project
 from .camera import resized as resized
 from .camera import scale as scale
+from .camera import unproject as unproject
 from .rigid import Similarity as Similarity
