@@ -1,0 +1,128 @@
+"""The house's own rules: how long things are, and what a public function says of itself."""
+
+import ast
+from pathlib import Path
+
+import jaxpose
+
+PACKAGE = Path(jaxpose.__file__).parent
+LINES_OF_A_FILE, LINES_OF_A_FUNCTION = 400, 60
+
+# What is longer today. These may shrink, and go when they are short enough; nothing is added.
+LONG_FILES = {"geometry/se3.py": 449}
+LONG_FUNCTIONS = {
+    "cli/fit/command.py run": 61,
+    "imu/filtering.py filter_imu": 66,
+    "slam/map/photometric.py make_descend": 61,
+    "slam/tracking/steps.py make_track": 64,
+}
+# Public functions whose docstring lacks Args or Returns. They go as they get them; nothing is added.
+SILENT = {f"{room}.{name}" for room, names in {
+    "datasets.events": "detect find find_format load load_events npz_stream",
+    "datasets": "every select take thin",
+    "datasets.photos": "load transforms_file write_transforms",
+    "datasets.rgbd": "detect find_format load load_camera load_imu load_recording load_truth read_list",
+    "datasets.synthetic": (
+        "camera correlated distance event_orbit image independent orbit orbit_poses paint "
+        "room"
+    ),
+    "evaluation": (
+        "align align_trajectory ate lpips path_length pose_errors procrustes psnr rpe ssim "
+        "statistics umeyama"
+    ),
+    "events": (
+        "change_residual cumulative_polarity find_displacement index_by_pixel locate log_intensity "
+        "mosaic_mask simulate warped"
+    ),
+    "fields": (
+        "anchored body_to_camera bspline bspline_factor components constant_factor control_points "
+        "control_points_along dof_loss effective_dof fit in_frame intrinsic load motion outer_loss "
+        "per_frame_factor piecewise_geodesic piecewise_geodesic_factor posenet posenet_factor "
+        "project_onto_poses refine set_progress stop_rotation table velocity write_field"
+    ),
+    "files": (
+        "associate load nearest orthonormal peak_rss_bytes read_camera read_euroc read_kitti read_points "
+        "read_stamps read_trajectory read_tum run_folder save versions write_camera write_colmap "
+        "write_euroc write_kitti write_ply write_tum"
+    ),
+    "geometry": (
+        "angle_of_view nearest_rotation pixel_grid project_numpy resized rotation_angle_deg scale "
+        "unproject_numpy"
+    ),
+    "imu": (
+        "accelerometer_residual add_noise backward difference filter_imu forward gravity_note "
+        "gyro_loose_residual gyro_tight_residual imu_residuals integrate_gyro interpolant propagate "
+        "remove_gravity residual_sigmas retract rotate simulate simulate_from_poses transition windows"
+    ),
+    "jaxpose": (
+        "composite density_weights occupancy_weights render_ray sample_depths sdf_weights "
+        "surface_weights weighted_mean"
+    ),
+    "plots": (
+        "balance cameras comparison corner_errors curves errors freedom held_out inertial preview "
+        "reconstruction renders trajectory windows"
+    ),
+    "scenes": "bounding_grid grid grow image merge nerf node_positions node_shape trilinear",
+    "slam": "load run save",
+    "training": (
+        "asynchronous_pairs draw_depths joint microbatched_sum pixel_ray ray_colour trainer viewer "
+        "window_pairs"
+    ),
+}.items() for name in names.split()}  # fmt: skip
+
+
+def lengths() -> tuple[dict[str, int], dict[str, int]]:
+    """Lines of the files and functions that are too long."""
+    files, functions = {}, {}
+    for file in sorted(PACKAGE.rglob("*.py")):
+        name, source = file.relative_to(PACKAGE).as_posix(), file.read_text()
+        files[name] = len(source.splitlines())
+        for node in ast.walk(ast.parse(source)):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and node.end_lineno:
+                functions[f"{name} {node.name}"] = node.end_lineno - node.lineno + 1
+    assert len(files) > 100 and len(functions) > 500
+    long = lambda counts, most: {name: count for name, count in counts.items() if count > most}
+    return long(files, LINES_OF_A_FILE), long(functions, LINES_OF_A_FUNCTION)
+
+
+def test_no_file_and_no_function_grows_too_long():
+    for found, known in zip(lengths(), (LONG_FILES, LONG_FUNCTIONS), strict=True):
+        assert {name: count for name, count in found.items() if count > known.get(name, 0)} == {}
+        assert known.keys() <= found.keys(), "short enough now: take it out of the list"
+
+
+def public_functions() -> dict[str, ast.FunctionDef]:
+    """Functions that a package names in its stub, and those of modules that it names, as room.function."""
+    found = {}
+    for stub in sorted(PACKAGE.rglob("__init__.pyi")):
+        for node in ast.parse(stub.read_text()).body:
+            if not isinstance(node, ast.ImportFrom):
+                continue
+            for alias in node.names:
+                file = stub.parent.joinpath(*(node.module or alias.name).split(".")).with_suffix(".py")
+                if not file.is_file():
+                    continue  # of another package, which has a stub of its own
+                room = ".".join(file.relative_to(PACKAGE).parts[:-1] or ("jaxpose",))
+                for inner in ast.parse(file.read_text()).body:
+                    if isinstance(inner, ast.FunctionDef) and not inner.name.startswith("_"):
+                        if node.module is None or inner.name == alias.name:
+                            found[f"{room}.{inner.name}"] = inner
+    return found
+
+
+def lacks(function: ast.FunctionDef) -> str:
+    """Which parts a docstring does not have."""
+    text, arguments = ast.get_docstring(function) or "", function.args
+    parts = []
+    if arguments.posonlyargs or arguments.args or arguments.kwonlyargs:
+        parts.append("Args")
+    if function.returns is None or ast.unparse(function.returns) != "None":
+        parts.append("Returns")
+    return " ".join(part for part in parts if f"\n{part}:\n" not in text)
+
+
+def test_public_functions_say_what_they_take_and_give():
+    functions = public_functions()
+    assert {"fields.fit", "jaxpose.render_ray", "geometry.exp"} <= functions.keys()
+    silent = {name for name, function in functions.items() if lacks(function)}
+    assert silent - SILENT == set()
