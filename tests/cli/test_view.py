@@ -22,7 +22,8 @@ from jaxpose.cli import main as main_command
 from jaxpose.cli.view import command as view
 from jaxpose.cli.view import page as view_page
 from jaxpose.cli.view.command import Config
-from jaxpose.cli.view.scene import WIDTH, read_scene, up_direction
+from jaxpose.cli.view.scene import read_scene, up_direction
+from jaxpose.cli.view.types import WIDTH
 from jaxpose.errors import DataError
 from jaxpose.experiments.slam.map_files import SavedMap, write_map
 from jaxpose.fields import serialization

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -21,10 +22,12 @@ from jaxpose.evaluation import trajectory_error
 from jaxpose.experiments import imu_slam, rgbd_slam
 from jaxpose.experiments.slam import pipeline as slam_pipeline
 from jaxpose.experiments.slam.options import load
-from jaxpose.experiments.slam.report import report, table
+from jaxpose.experiments.slam.report import progress_bar, report, table
 from jaxpose.fields import numpy_evaluator
 from jaxpose.files import atomic, trajectories
 from jaxpose.files.camera_json import read_camera
+from jaxpose.slam.pipeline import Progress
+from jaxpose.slam.types import no_frames
 
 README = Path(__file__).parents[2] / "README.md"
 FRAMES = 8
@@ -150,6 +153,16 @@ def test_rgbd_slam_on_a_folder(folder, tmp_path, capsys):
     )
 
 
+def test_the_progress_of_a_resumed_run_begins_where_it_goes_on(capsys):
+    """Its first frame is not frame 0."""
+    frames = no_frames(5)._replace(lost=np.array([True, False, True, False, False]))
+    on_frame = progress_bar()
+    for index in (3, 4):
+        on_frame("none", Progress(index, 5, SimpleNamespace(frames=frames), 0.01))
+    said = capsys.readouterr().err
+    assert "5/5" in said and "lost=2" in said and "1.0 cm" in said
+
+
 def test_compare_runs_every_mode(finished, tmp_path, monkeypatch, recording):
     modes = []
 
@@ -265,9 +278,10 @@ def test_a_failed_run_takes_away_only_what_it_made(folder, tmp_path):
     out = tmp_path / "out"
     out.mkdir()
     (out / "mine.txt").write_text("mine")
+    (out / "pictures").mkdir()
     Image.fromarray(np.zeros((60, 80), np.uint16)).save(folder / "frame-000000.depth.png")
     complaint(rgbd_slam.main, "--data", folder, "--out", out)
-    assert [path.name for path in out.iterdir()] == ["mine.txt"]
+    assert {path.name for path in out.iterdir()} == {"mine.txt", "pictures"}
 
 
 def test_exit_code_and_streams():

@@ -296,16 +296,30 @@ def test_atomic_replaces_at_the_end_only(tmp_path):
 
 def test_run_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    named = run_folder.run_folder("imu_slam", name="mine")
-    assert named == Path("outputs/imu_slam/mine") and named.is_dir()
-    assert run_folder.run_folder("imu_slam", name="mine") == named
-    stamped = {run_folder.run_folder("imu_slam") for _ in range(3)}
-    assert len(stamped) == 3 and all(folder.is_dir() and folder.parent == named.parent for folder in stamped)
-    assert run_folder.run_folder("imu_slam", out=tmp_path / "a/b") == tmp_path / "a/b"
-    assert (tmp_path / "a/b").is_dir()
+    named = run_folder.folder_path("imu_slam", name="mine")
+    assert named == Path("outputs/imu_slam/mine") and not named.exists()
+    for _ in range(2):  # a named folder may exist
+        with run_folder.opened(named) as folder:
+            assert folder == named and named.is_dir()
+    stamped = {run_folder.folder_path("imu_slam") for _ in range(3)}
+    assert len(stamped) == 3 and {folder.parent for folder in stamped} == {named.parent}
+    assert run_folder.folder_path("imu_slam", out=tmp_path / "a/b") == tmp_path / "a/b"
     (tmp_path / "file").write_text("")
-    with pytest.raises(OSError):
-        run_folder.run_folder("imu_slam", out=tmp_path / "file")
+    with pytest.raises(OSError), run_folder.opened(tmp_path / "file"):
+        pass
+
+
+def test_a_failed_run_takes_away_no_folder_but_its_own(tmp_path):
+    """Neither the user's empty folders, nor anything that holds a file."""
+    (tmp_path / "out" / "mine").mkdir(parents=True)
+    for folder, written in (("out", None), ("new/run", None), ("other/run", "results.json")):
+        with pytest.raises(KeyError), run_folder.opened(tmp_path / folder) as inner:
+            if written:
+                (inner / written).touch()
+            raise KeyError
+    assert {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")} == {
+        "out", "out/mine", "other", "other/run", "other/run/results.json",
+    }  # fmt: skip
 
 
 def test_peak_rss_sees_memory_that_was_freed():

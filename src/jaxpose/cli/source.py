@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxpose.errors import DataError
-from jaxpose.fields import numpy_evaluator
 from jaxpose.files import trajectories, trajectory_reader
 
 FIELD = "field.npz"
@@ -59,6 +58,8 @@ def read_field(source: Source) -> Callable[[Float[np.ndarray, " n"]], Float[np.n
     file = source.path / FIELD
     if not file.is_file():
         raise DataError(f"{file}: expected the continuous trajectory of the run, got nothing")
+    from jaxpose.fields import numpy_evaluator  # here, as its room loads jax, which --help does without
+
     try:
         return numpy_evaluator.load(file)
     except (ValueError, EOFError, zipfile.BadZipFile) as error:

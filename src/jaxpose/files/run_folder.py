@@ -1,6 +1,9 @@
 """The folder of a run, and what it states about machine and versions."""
 
+import os
 import platform
+from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
 
@@ -9,15 +12,32 @@ import numpy as np
 import jaxpose
 
 
-def run_folder(experiment: str, *, name: str | None = None, out: Path | str | None = None) -> Path:
-    """Make and return the folder of a run: `out` if given, else `outputs/<experiment>/<name or timestamp>`.
-
-    A folder that was named may exist already, to be written over or resumed.
-    """
+def folder_path(experiment: str, *, name: str | None = None, out: Path | str | None = None) -> Path:
+    """The folder of a run: `out` if given, else `outputs/<experiment>/<name or timestamp>`; not made yet."""
     timestamp = f"{datetime.now():%Y-%m-%d_%H-%M-%S.%f}"
-    folder = Path(out) if out is not None else Path("outputs") / experiment / (name or timestamp)
-    folder.mkdir(parents=True, exist_ok=out is not None or name is not None)
-    return folder
+    return Path(out) if out is not None else Path("outputs") / experiment / (name or timestamp)
+
+
+@contextmanager
+def opened(folder: Path) -> Iterator[Path]:
+    """Make a run folder, and take it away again if what is done in it fails before anything is written.
+
+    A folder that exists is written over or resumed. Only folders that were made here are taken away, and only
+    empty ones. OSError at once where nothing can be written.
+    """
+    made = [path for path in (folder, *folder.parents) if not path.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        probe = folder / f".writable.{os.getpid()}"
+        probe.touch()
+        probe.unlink()
+        yield folder
+    except BaseException:
+        for path in made:
+            if any(path.iterdir()):
+                break
+            path.rmdir()
+        raise
 
 
 def peak_rss_bytes() -> int:

@@ -15,7 +15,7 @@ from scipy.ndimage import median_filter
 from scipy.spatial.transform import Rotation
 
 from jaxpose import fields
-from jaxpose.cli.fit.command import FEWEST, Fitted, Inertial, Sensor
+from jaxpose.cli.fit.types import FEWEST, Fitted, Inertial, Sensor
 from jaxpose.datasets.rgbd import euroc
 from jaxpose.errors import DataError
 from jaxpose.evaluation import trajectory_error

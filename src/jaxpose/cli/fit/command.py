@@ -12,16 +12,14 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 import tyro
-from jaxtyping import Float
 
+from jaxpose.cli.fit.types import FEWEST, Fitted, Sensor
 from jaxpose.cli.source import read_source
 from jaxpose.errors import DataError
-from jaxpose.evaluation.trajectory_error import Statistics
 from jaxpose.experiments.command import check_least, markdown_table
 from jaxpose.files.trajectories import Trajectory
 from jaxpose.geometry.rigid import Similarity
 
-FEWEST = 20  # poses, inertial readings
 _SLOW = 3.0  # times the best field's error
 
 
@@ -51,37 +49,6 @@ class Config:
             for value in values if isinstance(values, tuple) else (values,):
                 if value is not None and not 0 < value < np.inf:
                     raise ValueError(f"--{option.replace('_', '-')}: expected positive numbers, got {value}")
-
-
-class Inertial(NamedTuple):
-    """How far a field's derivatives are from readings, after constant biases and gravity are fitted."""
-
-    omega_rms: float  # rad/s, per axis
-    acceleration_rms: float  # m/s^2, per axis
-    gyro_bias: Float[np.ndarray, "3"]
-    gravity_world: Float[np.ndarray, "3"]  # m/s^2, in the trajectory's world
-    samples: int
-
-
-class Fitted(NamedTuple):
-    """A field and what is left of the poses that it has not seen."""
-
-    name: str
-    highest_hz: float
-    parameters: int
-    seconds: float
-    translation_m: Statistics
-    rotation_deg: Statistics
-    inertial: Inertial | None
-
-
-class Sensor(NamedTuple):
-    """What an IMU's readings are worth, one sigma a reading: by its data sheet, and by themselves."""
-
-    readings: int
-    rate_hz: float
-    stated: tuple[float, float]  # rad/s, m/s^2
-    measured: tuple[float, float]  # RMS of second differences / sqrt 6: sensor and vibration
 
 
 class Result(NamedTuple):

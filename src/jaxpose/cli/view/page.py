@@ -14,7 +14,7 @@ import viser
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from jaxpose.cli.view.scene import WIDTH, Picture, Scene
+from jaxpose.cli.view.types import WIDTH, Picture, Scene
 from jaxpose.errors import DataError
 from jaxpose.files.atomic import atomic
 from jaxpose.geometry.camera import angle_of_view

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxpose import scenes
-from jaxpose.cli.view.scene import Picture, Poses, Render
+from jaxpose.cli.view.types import Picture, Poses, Render
 from jaxpose.errors import DataError
 from jaxpose.experiments.event_nerf import pipeline as event_nerf
 from jaxpose.experiments.noisy_nerf import pipeline as noisy_nerf

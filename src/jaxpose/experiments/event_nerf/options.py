@@ -38,9 +38,8 @@ class Config:
     data: Path = ORBIT
     pose: Pose = "posenet"  # the trajectory is refined by a PoseNet, or stays as it starts
     loss: Loss = "asynchronous"  # each event at its own time, or EventNeRF's windows
-    preset: Literal["fast", "paper"] = (
-        "fast"  # a small network for CPUs, or the sizes of EventNeRF and the paper
-    )
+    # A small network for CPUs, or the sizes of EventNeRF and the paper.
+    preset: Literal["fast", "paper"] = "fast"
     # "unknown": nothing is known of the poses; the start is the steady slide along the image that makes the
     # events sharpest, so that the recording must be short, and lengths are in typical depths.
     poses: Literal["known", "unknown"] = "known"

@@ -49,16 +49,15 @@ def run(config: Config, on_progress: OnProgress | None = None) -> Outcome:
     started = time.perf_counter()
     recording = read(config)
     problem = begin(config, recording)
-    folder = run_folder.run_folder("event_nerf", name=config.name, out=config.out)
-    if config.study is None:
-        return Outcome(folder, _single(config, problem, folder, on_progress, ""))
-    results = {}
-    for label, changed in _study(config, config.study).items():
-        inner = folder / label
-        inner.mkdir(exist_ok=True)
-        changed = replace(changed, study=None)
-        results[label] = _single(changed, begin(changed, recording), inner, on_progress, label)
-    return training_loop.write_study(folder, "event_nerf", config, results, table(results), started)
+    with run_folder.opened(run_folder.folder_path("event_nerf", name=config.name, out=config.out)) as folder:
+        if config.study is None:
+            return Outcome(folder, _single(config, problem, folder, on_progress, ""))
+        results = {}
+        for label, changed in _study(config, config.study).items():
+            changed = replace(changed, study=None)
+            with run_folder.opened(folder / label) as inner:
+                results[label] = _single(changed, begin(changed, recording), inner, on_progress, label)
+        return training_loop.write_study(folder, "event_nerf", config, results, table(results), started)
 
 
 def load_run(folder: Path | str) -> Loaded[Problem, Setup]:

@@ -29,9 +29,8 @@ class Config:
 
     # A folder in the layout of Blender, nerfstudio, instant-ngp or LLFF; "orbit": an object made on the fly.
     data: Path = ORBIT
-    pose: Pose = (
-        "posenet"  # the pose field; spline_reset: a table, reset to a smoothing spline every 100 steps
-    )
+    # The pose field. spline_reset: a pose per image, reset to a smoothing spline every 100 steps.
+    pose: Pose = "posenet"
     preset: Literal["fast", "paper"] = "fast"  # a small network for CPUs, or BARF's with the paper's schedule
     # Of the poses that the run starts from. "none": as the data has them; "unknown": all in one place.
     noise: Literal["correlated", "independent", "none", "unknown"] = "correlated"

@@ -40,17 +40,16 @@ def run(config: Config, on_progress: OnProgress | None = None) -> Outcome:
     """
     started = time.perf_counter()
     problem = load(config)
-    folder = run_folder.run_folder("noisy_nerf", name=config.name, out=config.out)
-    if config.study is None:
-        return Outcome(folder, _single(config, problem, folder, on_progress, ""))
-    results, histories = {}, {}
-    for label, changed in STUDIES[config.study](config).items():
-        inner = folder / label
-        inner.mkdir(exist_ok=True)
-        results[label] = _single(replace(changed, study=None), problem, inner, on_progress, label)
-        histories[label] = _history(np.array(results[label]["history"], float))
-    nerf_plots.curves(folder / "curves.png", histories, f"{_title(problem)}: {config.study}")
-    return training_loop.write_study(folder, "noisy_nerf", config, results, table(results), started)
+    with run_folder.opened(run_folder.folder_path("noisy_nerf", name=config.name, out=config.out)) as folder:
+        if config.study is None:
+            return Outcome(folder, _single(config, problem, folder, on_progress, ""))
+        results, histories = {}, {}
+        for label, changed in STUDIES[config.study](config).items():
+            with run_folder.opened(folder / label) as inner:
+                results[label] = _single(replace(changed, study=None), problem, inner, on_progress, label)
+            histories[label] = _history(np.array(results[label]["history"], float))
+        nerf_plots.curves(folder / "curves.png", histories, f"{_title(problem)}: {config.study}")
+        return training_loop.write_study(folder, "noisy_nerf", config, results, table(results), started)
 
 
 def train(

@@ -93,14 +93,26 @@ def run(config: Config, on_progress: Callable[[Progress], None] | None = None) -
     assert config.image is not None
     photo = planar_task.read_photo(config.image)
     planar_task.draw(config.setup, photo, config.seed, 0)  # refuses an image before there is a folder
-    folder = run_folder.run_folder("planar", name=config.name, out=config.out)
-    if not config.compare:
+    with run_folder.opened(run_folder.folder_path("planar", name=config.name, out=config.out)) as folder:
+        if config.compare:
+            return Outcome(folder, _compare(config, photo, folder, on_progress, started))
         return Outcome(folder, _field(config, photo, folder, on_progress))
+
+
+def _compare(
+    config: Config,
+    photo: Photo,
+    folder: Path,
+    on_progress: Callable[[Progress], None] | None,
+    started: float,
+) -> dict[str, Any]:
+    """All motions with each pose field, and the fields side by side."""
+    assert config.image is not None
     by_field, curves = {}, {}
     for pose in get_args(Pose):
-        (folder / pose).mkdir(exist_ok=True)
         single = replace(config, compare=False, pose=pose)
-        by_field[pose] = _field(single, photo, folder / pose, on_progress)
+        with run_folder.opened(folder / pose) as inner:
+            by_field[pose] = _field(single, photo, inner, on_progress)
         curves[pose] = _curves(_finished(folder / pose, config.motions))
     title = f"{config.image.name}, {config.motions} motions of the paper's set-up, seed {config.seed}"
     steps = CHUNK * np.arange(curves["posenet"].shape[1], dtype=float)
@@ -117,7 +129,7 @@ def run(config: Config, on_progress: Callable[[Progress], None] | None = None) -
     atomic.write_json(folder / "config.json", config)
     atomic.write_text(folder / "table.md", table(by_field) + "\n")
     atomic.write_json(folder / "results.json", results)
-    return Outcome(folder, results)
+    return results
 
 
 def main(args: Sequence[str] | None = None) -> None:

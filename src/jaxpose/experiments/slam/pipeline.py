@@ -2,8 +2,7 @@
 
 import json
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -55,26 +54,12 @@ def run(experiment: str, options: Options, on_frame: OnFrame | None = None) -> O
     """
     started = time.perf_counter()
     source = load(options)
-    with _folder(experiment, options) as folder:
+    path = run_folder.folder_path(experiment, name=options.name, out=options.out)
+    with run_folder.opened(path) as folder:
         if options.compare:
             return Outcome(folder, _compare(experiment, options, source, folder, on_frame, started))
         results, _ = _single(experiment, options, source, folder, on_frame, started)
         return Outcome(folder, results)
-
-
-@contextmanager
-def _folder(experiment: str, options: Options) -> Iterator[Path]:
-    """The run folder, tried for writing before hours are spent; taken away if the run leaves it empty."""
-    folder = run_folder.run_folder(experiment, name=options.name, out=options.out)
-    probe = folder / ".writable"
-    probe.touch()
-    probe.unlink()
-    try:
-        yield folder
-    finally:
-        for inner in (*folder.glob("*/"), folder):
-            if not any(inner.iterdir()):
-                inner.rmdir()
 
 
 def _compare(
@@ -84,10 +69,10 @@ def _compare(
     by_mode, errors = {}, {}
     for mode in get_args(ImuMode):
         single = replace(options, compare=False, slam=replace(options.slam, imu=mode))
-        (folder / mode).mkdir(exist_ok=True)
-        by_mode[mode], errors[mode] = _single(
-            experiment, single, source, folder / mode, on_frame, time.perf_counter()
-        )
+        with run_folder.opened(folder / mode) as inner:
+            by_mode[mode], errors[mode] = _single(
+                experiment, single, source, inner, on_frame, time.perf_counter()
+            )
         jax.clear_caches()  # a mode's compiled steps are of no use to the next, and fill memory
     results = {
         "experiment": experiment,

@@ -21,10 +21,15 @@ def progress_bar() -> Callable[[ImuMode, Progress], None]:
 
     def on_frame(mode: ImuMode, progress: Progress) -> None:
         nonlocal bar, lost
-        if progress.index == 0:
-            bar = tqdm(total=progress.count, desc=f"IMU {mode}", unit="frame", file=sys.stderr)
-            lost = 0
-        assert bar is not None
+        if bar is None:  # a resumed run begins at a later frame
+            bar = tqdm(
+                total=progress.count,
+                initial=progress.index,
+                desc=f"IMU {mode}",
+                unit="frame",
+                file=sys.stderr,
+            )
+            lost = int(progress.state.frames.lost[: progress.index].sum())
         frames = progress.state.frames
         lost += bool(frames.lost[progress.index])
         loss = float(frames.loss[progress.index])
@@ -35,6 +40,7 @@ def progress_bar() -> Callable[[ImuMode, Progress], None]:
         bar.update()
         if progress.index == progress.count - 1:
             bar.close()
+            bar = None
 
     return on_frame
 
