@@ -17,6 +17,7 @@ import jaxtyping
 import matplotlib
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -88,3 +89,16 @@ def save():
 def metres():
     """Depth [m] that counts mean."""
     return lambda counts, per_metre: np.where(counts == 65535, 0, counts) / per_metre
+
+
+@pytest.fixture
+def figures(monkeypatch) -> list[Figure]:
+    """The figures that were saved, to be asked what they hold."""
+    saved, savefig = [], Figure.savefig
+
+    def save_and_keep(figure, *args, **options):
+        saved.append(figure)
+        return savefig(figure, *args, **options)
+
+    monkeypatch.setattr(Figure, "savefig", save_and_keep)
+    return saved

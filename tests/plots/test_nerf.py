@@ -3,22 +3,10 @@
 import matplotlib
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from jaxpose.plots import nerf as nerf_plots
-
-
-@pytest.fixture
-def figures(monkeypatch):
-    """The figures that were saved, to be asked what they hold."""
-    saved = []
-    whole = Figure.savefig
-    monkeypatch.setattr(
-        Figure, "savefig", lambda self, *a, **k: (saved.append(self), whole(self, *a, **k))[1]
-    )
-    return saved
 
 
 def read(path):
