@@ -12,6 +12,7 @@ from .preintegration import remove_gravity as remove_gravity
 from .residuals import ImuResiduals as ImuResiduals
 from .residuals import ResidualSigmas as ResidualSigmas
 from .residuals import accelerometer_residual as accelerometer_residual
+from .residuals import covers as covers
 from .residuals import gyro_loose_residual as gyro_loose_residual
 from .residuals import gyro_tight_residual as gyro_tight_residual
 from .residuals import imu_residuals as imu_residuals

@@ -107,6 +107,13 @@ def imu_residuals(
     )
 
 
+def covers(imu: Imu, start: float, end: float) -> bool:
+    """Whether readings reach from `start` to `end` [s], to within one and a half samples."""
+    t = np.asarray(imu.t)
+    slack = np.median(np.diff(t)) * 1.5 if len(t) > 1 else 0.0
+    return bool(len(t) and start >= t[0] - slack and end <= t[-1] + slack)
+
+
 def windows(imu: Imu, frame_times: Float[np.ndarray, " m"]) -> tuple[Imu, Bool[np.ndarray, "m-1 s"]]:
     """Cut readings (numpy) into the intervals between frames, padded to one size `s`, with a mask.
 

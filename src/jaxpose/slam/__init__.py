@@ -1,4 +1,7 @@
-"""RGB-D SLAM on a continuous trajectory."""
+"""Dense RGB-D(-inertial) SLAM on a continuous trajectory.
+
+`init`, `step` and `finish` take frames one by one, as a camera gives them; `run` tracks a recording.
+"""
 
 import lazy_loader
 

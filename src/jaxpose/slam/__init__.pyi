@@ -3,8 +3,16 @@ from . import config as config
 from . import map as map
 from . import tracking as tracking
 from .config import ImuMode as ImuMode
+from .config import MapConfig as MapConfig
+from .config import RecoveryConfig as RecoveryConfig
 from .config import SlamConfig as SlamConfig
+from .config import TrackConfig as TrackConfig
 from .pipeline import Progress as Progress
 from .pipeline import SlamResult as SlamResult
+from .pipeline import finish as finish
+from .pipeline import init as init
 from .pipeline import run as run
+from .pipeline import step as step
+from .types import Frames as Frames
 from .types import SlamState as SlamState
+from .types import TrackingStatus as TrackingStatus

@@ -2,58 +2,72 @@
 
 import zipfile
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
+from jaxpose.datasets.types import Recording
 from jaxpose.errors import DataError
 from jaxpose.files import checkpoint as checkpoint_file
 from jaxpose.scenes import GridConfig
+from jaxpose.slam.config import SlamConfig
+from jaxpose.slam.map.backend import map_backend
 from jaxpose.slam.pipeline import begin
-from jaxpose.slam.system import System
-from jaxpose.slam.types import SlamState
+from jaxpose.slam.types import SlamState, no_frames
 
-
-class _Box(NamedTuple):
-    """A grid's size as arrays."""
-
-    lower: np.ndarray
-    upper: np.ndarray
-    voxel: np.ndarray
-    levels: np.ndarray
-    truncation: np.ndarray
+_GRID = ("lower", "upper", "voxel", "levels", "truncation")
 
 
 def save(path: Path | str, state: SlamState) -> None:
-    """Write a run's state, whole or not at all."""
-    size = state.grid
-    box = _Box(*(np.asarray(getattr(size, name)) for name in _Box._fields))
-    checkpoint_file.save(path, _as_arrays(state, box))
+    """Write the state of a recording's run after one or more frames, whole or not at all."""
+    assert state.grid is not None
+    checkpoint_file.save(path, _as_arrays(state, {name: getattr(state.grid, name) for name in _GRID}))
 
 
-def load(path: Path | str, system: System) -> SlamState:
+def load(path: Path | str, recording: Recording, config: SlamConfig) -> SlamState:
     """Read what `save` wrote of a run of this recording and these settings.
 
     DataError naming the file if it is damaged or of another run.
     """
     try:
         with np.load(path, allow_pickle=False) as file:
-            box = _Box(*(file[f".grid.{name}"] for name in _Box._fields))
+            size = {name: file[f"['grid']['{name}']"] for name in _GRID}
+            frames, keyframes = len(file["['state'].frames.t"]), len(file["['state'].thumbnails"])
+            readings = len(file["['state'].imu.t"]) if "['state'].imu.t" in file else None
     except (zipfile.BadZipFile, ValueError, EOFError, KeyError) as error:
         raise DataError(f"{path}: expected a checkpoint, got {' '.join(str(error).split())}") from None
-    size = GridConfig(
-        tuple(box.lower.tolist()),
-        tuple(box.upper.tolist()),
-        float(box.voxel),
-        int(box.levels),
-        float(box.truncation),
+    grid = GridConfig(
+        tuple(size["lower"].tolist()),
+        tuple(size["upper"].tolist()),
+        float(size["voxel"]),
+        int(size["levels"]),
+        float(size["truncation"]),
     )
-    state = checkpoint_file.load(path, _as_arrays(begin(system, size), box))
+    state = begin(recording, config)._replace(
+        frames=no_frames(np.zeros(frames)), thumbnails=np.zeros((keyframes, 2, 12, 16)), grid=grid
+    )
+    if readings is not None and recording.imu is not None:
+        state = state._replace(
+            imu=type(recording.imu)(*(np.resize(x, (readings, *np.shape(x)[1:])) for x in recording.imu))
+        )
+    state = state._replace(map=map_backend(state).start())
+    state = checkpoint_file.load(path, _as_arrays(state, size))["state"]
+    if frames > len(recording.t) or (state.frames.t != recording.t[:frames]).any():
+        raise DataError(
+            f"{path}: expected a run over frames at the times of {recording.name}, got other times"
+        )
     return state._replace(
-        done=int(state.done), far=float(state.far), gyro_bias_sigma=float(state.gyro_bias_sigma), grid=size
+        config=config,
+        grid=grid,
+        camera=recording.camera,
+        max_depth=float(state.max_depth),
+        duration_s=float(state.duration_s),
     )
 
 
-def _as_arrays(state: SlamState, box: _Box) -> Any:
-    numbers = {name: np.asarray(getattr(state, name)) for name in ("done", "far", "gyro_bias_sigma")}
-    return state._replace(**numbers, grid=box)
+def _as_arrays(state: SlamState, size: dict[str, Any]) -> dict[str, Any]:
+    """What a checkpoint holds: the state but for what the recording and the settings give again."""
+    numbers = {name: np.asarray(getattr(state, name)) for name in ("max_depth", "duration_s")}
+    motion = state.motion._replace(gyro_bias_sigma=np.asarray(state.motion.gyro_bias_sigma))
+    state = state._replace(**numbers, motion=motion, camera=None, config=None, grid=None, images=())
+    return {"state": state, "grid": {name: np.asarray(value) for name, value in size.items()}}

@@ -1,15 +1,23 @@
-"""Settings of a SLAM run."""
+"""Settings of a SLAM run, all of them, each checked where it is made."""
 
-from dataclasses import dataclass
-from typing import Literal
+import math
+from dataclasses import dataclass, fields
+from typing import Literal, NamedTuple
 
 from jaxpose.fields import PoseNetConfig
 from jaxpose.imu import ADIS16448, ImuNoise
-from jaxpose.slam.map.photometric import MapConfig
-from jaxpose.slam.tracking.objective import ImuWeights, TrackConfig
-from jaxpose.slam.tracking.reference_frames import FrameName
 
 ImuMode = Literal["none", "loose", "tight", "accelerometer", "combined"]
+FrameName = Literal["anchored", "default", "world", "random", "intrinsic"]
+
+
+class ImuWeights(NamedTuple):
+    """Weights of the three inertial losses (Ma et al. 2024, section 3.4); 0 leaves one out."""
+
+    loose: float = 0.0
+    tight: float = 0.0
+    accelerometer: float = 0.0
+
 
 IMU_WEIGHTS: dict[ImuMode, ImuWeights] = {
     "none": ImuWeights(),
@@ -18,6 +26,107 @@ IMU_WEIGHTS: dict[ImuMode, ImuWeights] = {
     "accelerometer": ImuWeights(accelerometer=1.0),
     "combined": ImuWeights(loose=1.0, tight=1.0, accelerometer=1.0),
 }
+
+
+def _check(config, name: str, *, at_least: dict[str, int] | None = None, positive: tuple[str, ...] = ()):
+    for field, least in (at_least or {}).items():
+        if getattr(config, field) < least:
+            raise ValueError(f"{name}.{field}: expected {least} or more, got {getattr(config, field)}")
+    for field in positive:
+        if not 0 < getattr(config, field) < math.inf:
+            raise ValueError(f"{name}.{field}: expected a positive number, got {getattr(config, field)}")
+
+
+@dataclass(frozen=True)
+class SampleConfig:
+    """Samples along a ray: evenly up to the measured surface, denser through it, a few behind."""
+
+    front: int = 6
+    surface: int = 16
+    behind: int = 2
+    band: float = 0.12  # [m] to either side of the measured depth that counts as the surface
+    width: float = 0.015  # [m] thickness of a rendered surface (`render.sdf_weights`)
+
+    def __post_init__(self):
+        _check(self, "sample", at_least={"front": 1, "surface": 2, "behind": 0}, positive=("band", "width"))
+
+
+@dataclass(frozen=True)
+class TrackConfig:
+    """How one frame is tracked.
+
+    `gradient` is the paper's way: Adam on the field through the renderer, pixels drawn anew in each
+    iteration. `gauss_newton` registers the frame to the map's surface by second-order steps on its pose.
+    """
+
+    method: Literal["gauss_newton", "gradient"] = "gauss_newton"
+    pixels: int = 5000  # 200 to 1000 for `gradient`, which draws new ones in each iteration
+    edge: int = 8  # [px] border left out
+    iterations: int = 25  # at most; 150 for `gradient`
+    patience: int = 30  # of `gradient`: iterations without a lower loss after which to stop
+    learning_rate: float = 1e-3  # of `gradient`: Adam, of TransNet [per translation_scale]
+    rotation_rate: float = 2e-4  # and of RotsNet
+    decay: float = 0.1  # of both rates over the iterations
+    field_steps: int = 60  # of `gradient`: Adam steps of fitting the field to the predicted motion
+    colour_weight: float = 0.1  # of the colour residual against the depth residual, both in sigmas
+    dof_weight: float = 0.1  # of L_dof, in the frame intrinsic under `gradient`
+    minimum_valid: float = 0.2  # share of the pixels the map must explain
+    sample: SampleConfig = SampleConfig()
+
+    def __post_init__(self):
+        least = {"pixels": 1, "iterations": 1, "field_steps": 1, "patience": 1, "edge": 0}
+        _check(self, "track", at_least=least, positive=("learning_rate", "rotation_rate", "decay"))
+
+
+@dataclass(frozen=True)
+class MapConfig:
+    """How the scene is mapped; all but the first is of the method `gradient`, the paper's way."""
+
+    method: Literal["fused", "gradient"] = "fused"
+    pixels: int = 1000  # per iteration, shared by the frames of the window
+    edge: int = 4
+    window: int = 5  # frames: the current one, the last keyframe, and keyframes that overlap
+    iterations: int = 20
+    first_iterations: int = 200
+    learning_rate: float = 2e-3  # of Adam
+    first_rate: float = 5e-3
+    sample: SampleConfig = SampleConfig(front=8, surface=14, behind=0)
+
+    def __post_init__(self):
+        least = {"pixels": 1, "window": 1, "iterations": 1, "first_iterations": 1, "edge": 0}
+        _check(self, "map", at_least=least, positive=("learning_rate", "first_rate"))
+
+
+@dataclass(frozen=True)
+class RecoveryConfig:
+    """When a registration is believed, doubted, or searched for: the policy of tracking, with its reasons.
+
+    Records of the runs behind the numbers are in `experiments/README.md`.
+    """
+
+    held: float = 0.08  # [m, rad] a prediction from the IMU that cannot be off by more is as good as no loss
+    farthest: float = 0.5  # [m, rad] a search reaches no farther around a prediction; then anywhere
+    around_keyframes: float = 0.25  # [m, rad] a search reaches around keyframes where nothing else is known
+    recognised_valid: float = 0.7  # after a loss, of a camera that could be anywhere: share explained,
+    recognised_loss: float = 1.1  # and loss against the usual
+    found_valid: float = 0.5  # the same of a camera that must be near
+    found_loss: float = 1.3
+    lost_loss: float = 2.0  # against the usual: a registration that is worse has failed
+    reckoned: float = 0.3  # [m, rad] a pose from the IMU alone is good enough to go on from
+    weak: float = 0.02  # [m, rad] a pose known less well is weak
+    least_depth: float = 0.01  # share of an image; with less there is nothing to register
+    colour_pulls: float = 0.03  # [m, rad] as far off as colour still pulls
+    worse_colour: float = 1.5  # against the usual error: search for a place with better colours
+    better_colour: float = 0.9  # against the other pose's error,
+    as_much: float = 0.7  # share explained
+    as_well: float = 1.3  # and loss: then the pose that a search found is taken
+    outlier_colour: float = 2.5  # against the usual; measured at most 2.2 at true poses, from 2.6 beside them
+    least_colour: float = 0.008  # an error that images without noise stay below; less says nothing
+    other_light_s: float = 2.0  # after which another colour everywhere is another light
+    fading_s: float = 0.5  # in which a speed that nothing senses is forgotten
+
+    def __post_init__(self):
+        _check(self, "recovery", positive=tuple(field.name for field in fields(self)))
 
 
 @dataclass(frozen=True)
@@ -30,6 +139,7 @@ class SlamConfig:
     field: PoseNetConfig = PoseNetConfig(layers=4, width=128, activation="softplus")
     track: TrackConfig = TrackConfig()
     map: MapConfig = MapConfig()
+    recovery: RecoveryConfig = RecoveryConfig()
     map_every_s: float = 0.15  # [s] between mapping steps
     voxel: float | None = None  # [m]; None: from the size of the room
     hold_out: int = 0  # every n-th frame is tracked but never mapped, to measure the map on; 0: none
@@ -37,21 +147,10 @@ class SlamConfig:
     imu_noise: ImuNoise = ADIS16448
 
     def __post_init__(self):
-        positive = {
-            "track.pixels": self.track.pixels,
-            "track.iterations": self.track.iterations,
-            "track.field_steps": self.track.field_steps,
-            "map.window": self.map.window,
-            "map.iterations": self.map.iterations,
-            "map.first_iterations": self.map.first_iterations,
-            "field.layers": self.field.layers,
-            "field.width": self.field.width,
-        }
-        for name, value in positive.items():
-            if value < 1:
-                raise ValueError(f"{name}: expected 1 or more, got {value}")
         if self.hold_out == 1 or self.hold_out < 0:
             raise ValueError(f"hold_out: expected 0, or 2 or more, got {self.hold_out}")
+        if self.voxel is not None and not 0 < self.voxel < math.inf:
+            raise ValueError(f"voxel: expected a positive number, got {self.voxel}")
 
     @property
     def uses_gyroscope(self) -> bool:
@@ -62,3 +161,11 @@ class SlamConfig:
     def uses_accelerometer(self) -> bool:
         """Whether the accelerometer carries the speed from one frame to the next."""
         return self.imu in ("accelerometer", "combined")
+
+    @property
+    def uses_field(self) -> bool:
+        """Whether a PoseNet is used: `gradient` tracks by it, and the intrinsic frame is made of two.
+
+        Registration by Gauss-Newton finds poses; the trajectory is then fitted to them once, at the end.
+        """
+        return self.track.method == "gradient" or self.frame == "intrinsic"

@@ -1,14 +1,16 @@
 """Keyframes: which frames are kept, and which of them a mapping step looks at again."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxpose.datasets.types import Frame, Recording
+from jaxpose.datasets.types import Frame
 from jaxpose.geometry.camera import Camera, project_numpy
 from jaxpose.slam.observation import Image, to_device
+
+FrameReader = Callable[[int], Frame]  # a frame by its index, counted from the first of the run
 
 
 class Keyframe(NamedTuple):
@@ -19,19 +21,19 @@ class Keyframe(NamedTuple):
     T_world_cam: np.ndarray  # (4, 4)
 
 
-def read_keyframes(
-    recording: Recording, indices: Int[np.ndarray, " k"], T_world_cam: Float[np.ndarray, "n 4 4"]
+def keyframe_images(
+    read: FrameReader, indices: Int[np.ndarray, " k"], T_world_cam: Float[np.ndarray, "n 4 4"]
 ) -> Iterator[Keyframe]:
-    """Keyframes one after the other, their images read anew, so that none is kept in memory.
+    """Keyframes one after the other, each image read when it is asked for.
 
     `T_world_cam` holds the poses of all frames.
     """
     for i in indices.tolist():
-        yield Keyframe(i, to_device(recording.read(i)), T_world_cam[i])
+        yield Keyframe(i, to_device(read(i)), T_world_cam[i])
 
 
-def look(frame: Frame) -> Float[np.ndarray, "2 12 16"]:
-    """What a frame looks like from afar: grey and depth, each with mean 0 and spread 1."""
+def thumbnail(frame: Frame) -> Float[np.ndarray, "2 12 16"]:
+    """A descriptor of what a frame looks like from afar: grey and depth, each with mean 0 and spread 1."""
     height, width = frame.depth.shape
     row, column = height // 12, width // 16
     cut = lambda x: x[: 12 * row, : 16 * column].reshape(12, row, 16, column)

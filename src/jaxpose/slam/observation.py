@@ -1,6 +1,5 @@
 """Pixels of an RGB-D frame as rays, where along them to sample the scene, what a sensor's depth is worth."""
 
-from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
@@ -14,6 +13,7 @@ from jaxpose.datasets.types import Frame
 from jaxpose.geometry import se3
 from jaxpose.geometry.camera import Camera, project, unproject
 from jaxpose.render import Query, Ray, Rendered
+from jaxpose.slam.config import SampleConfig
 
 _BLANK = 3.0  # [grey levels] spread of an image that is black or saturated
 
@@ -54,17 +54,6 @@ class Located(NamedTuple):
     row: Int[Array, "*n"]
     column: Int[Array, "*n"]
     inside: Bool[Array, "*n"]
-
-
-@dataclass(frozen=True)
-class SampleConfig:
-    """Samples along a ray: evenly up to the measured surface, denser through it, a few behind."""
-
-    front: int = 6
-    surface: int = 16
-    behind: int = 2
-    band: float = 0.12  # [m] to either side of the measured depth that counts as the surface
-    width: float = 0.015  # [m] thickness of a rendered surface (`render.sdf_weights`)
 
 
 def sample_pixels(key: PRNGKeyArray, image: Image, camera: Camera, count: int, *, edge: int) -> Pixels:

@@ -1,7 +1,11 @@
-"""The SLAM loop: predict, track, map, keep keyframes; at the end one field for the whole trajectory."""
+"""The SLAM loop: track, map, keep keyframes; at the end one field for the whole trajectory.
+
+`init`, `step` and `finish` are for frames that come one by one, `run` is for a recording; both are one loop.
+"""
 
 import time
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import jax
@@ -11,57 +15,163 @@ from jaxtyping import Float, Int
 
 from jaxpose.datasets.types import Frame, Recording
 from jaxpose.errors import DataError
-from jaxpose.fields import PoseField, bspline, control_points_along, fit
+from jaxpose.fields import Params, PoseField, bspline, control_points_along, fit
+from jaxpose.geometry.camera import Camera, angle_of_view
+from jaxpose.imu import GRAVITY_WORLD, Gravity, Imu
 from jaxpose.scenes import GridConfig, SceneField
-from jaxpose.slam.config import ImuMode, SlamConfig
-from jaxpose.slam.initial_pose import first_pose
-from jaxpose.slam.keyframes import read_keyframes
+from jaxpose.slam.config import SlamConfig
+from jaxpose.slam.initial_pose import first_pose, upright_pose
+from jaxpose.slam.keyframes import FrameReader, keyframe_images, thumbnail
+from jaxpose.slam.map.backend import (
+    framed_field,
+    grow_to_fit,
+    map_backend,
+    map_frame,
+    scene_params,
+    seen_points,
+)
 from jaxpose.slam.map.texture import make_texture, textured
-from jaxpose.slam.map.world import grow_to_fit, initial_grid, map_frame, scene_params, seen_points
 from jaxpose.slam.observation import is_blank, to_device
-from jaxpose.slam.system import System, make_system
 from jaxpose.slam.tracker import next_pose
-from jaxpose.slam.tracking.intrinsic_frame import Refit, is_due, window
+from jaxpose.slam.tracking.intrinsic_frame import is_due, make_refit, window
 from jaxpose.slam.tracking.predict import GYRO_BIAS_SIGMA
-from jaxpose.slam.types import SlamState, no_frames
-
-__all__ = ["ImuMode", "Progress", "SlamConfig", "SlamResult", "run"]
+from jaxpose.slam.types import Frames, Motion, SlamState, no_frames
 
 _DEFAULT = SlamConfig()
+_KEPT_S = 0.1  # of readings before the last frame, so that they can be interpolated there
 
 
 class Progress(NamedTuple):
-    """One frame done; `truth_error` [m] is the distance to ground truth with the first poses put together."""
+    """One frame done; `ground_truth_error` [m] with the first poses put together, NaN where there is none."""
 
     index: int
     count: int
     state: SlamState  # valid until the next frame, which writes over its map
-    truth_error: float
+    ground_truth_error: float
 
 
 class SlamResult(NamedTuple):
-    """A tracked recording."""
+    """A tracked sequence: poses, the map, and one continuous trajectory."""
 
-    T_world_cam: np.ndarray  # (n, 4, 4)
-    T_inner: np.ndarray  # (n, 4, 4) the body's motion since the last frame, in the frame `intrinsic`
-    lost: np.ndarray  # (n,) bool: tracking failed, the pose is the prediction
-    uncertain: np.ndarray  # (n,) bool: lost, unlike the map in colour, from the IMU, or little to hold on to
-    mapped: np.ndarray  # (n,) bool: the map was made from it
-    iterations: np.ndarray  # (n,)
-    loss: np.ndarray  # (n,)
-    depth_error: np.ndarray  # (n,) [m] median
-    colour_error: np.ndarray  # (n,) median, of colours in [0, 1]
-    valid: np.ndarray  # (n,)
-    sigma: np.ndarray  # (n, 2) [m, rad] of the pose, by what the image says of it
-    seconds: np.ndarray  # (n,) wall time, compilation included
+    T_world_cam: Float[np.ndarray, "n 4 4"]
+    frames: Frames
     scene: SceneField
     grid: GridConfig
-    scene_params: Any  # (values of the grid's nodes, their paint)
-    keyframes: Int[np.ndarray, " k"]  # which frames they are
-    field: PoseField  # camera in the world over the whole recording
-    field_params: Any
+    scene_params: Any  # (values of the grid's nodes, their texture)
+    field: PoseField  # camera in the world, over seconds since the first frame
+    field_params: Params
     field_rmse_m: float
     field_rmse_deg: float
+
+    @property
+    def keyframes(self) -> Int[np.ndarray, " k"]:
+        """Which frames are keyframes."""
+        return np.flatnonzero(self.frames.keyframe)
+
+
+def init(
+    camera: Camera,
+    config: SlamConfig = _DEFAULT,
+    *,
+    T_world_cam: Float[np.ndarray, "4 4"] | None = None,
+    T_body_cam: Float[np.ndarray, "4 4"] | None = None,
+    gravity_world: Gravity = GRAVITY_WORLD,
+    duration_s: float | None = None,
+) -> SlamState:
+    """A SLAM run before its first frame.
+
+    Args:
+        camera: intrinsics of colour and depth, which are registered to each other.
+        config: settings of the run.
+        T_world_cam: pose of the first camera. By default the world is upright by the readings that come with
+            the first frame, or is the first camera's frame where there are none.
+        T_body_cam: camera to IMU; by default the IMU is where the camera is.
+        gravity_world: gravity [m/s^2] in the world.
+        duration_s: length of the sequence, which the paper's frames of reference (all but `anchored`) need.
+
+    Returns:
+        The state to call `step` with.
+
+    Raises:
+        ValueError: for a pose that is no rigid transform, or a frame of reference without a duration.
+    """
+    rigid = {"T_world_cam": T_world_cam, "T_body_cam": T_body_cam}
+    poses = {name: None if T is None else _rigid(name, T) for name, T in rigid.items()}
+    if config.uses_field and config.frame != "anchored" and duration_s is None:
+        raise ValueError(f"slam.init: frame {config.frame} expected duration_s [s] of the sequence, got None")
+    framed = framed_field(config)
+    key, field_key = jax.random.split(jax.random.key(config.seed))
+    return SlamState(
+        camera=camera,
+        config=config,
+        T_body_cam=np.eye(4) if poses["T_body_cam"] is None else poses["T_body_cam"],
+        gravity_world=np.asarray(gravity_world, np.float64),
+        T_world_cam_first=poses["T_world_cam"],
+        duration_s=np.nan if duration_s is None else float(duration_s),
+        frames=no_frames(np.zeros(0)),
+        imu=None,
+        motion=Motion(np.zeros(6), np.zeros(3), np.zeros(3), GYRO_BIAS_SIGMA, np.zeros(3)),
+        params=None if framed is None else jax.jit(framed.field.init)(field_key),
+        key=key,
+        exposure=np.ones(3, np.float32),
+        max_depth=0.0,
+        thumbnails=np.zeros((0, 2, 12, 16)),
+        images=(),
+        grid=None,
+        map=None,
+    )
+
+
+def step(
+    state: SlamState,
+    rgb: np.ndarray,
+    depth: np.ndarray,
+    t: float,
+    imu: Imu | None = None,
+    *,
+    donate: bool = False,
+) -> SlamState:
+    """The run after one more frame.
+
+    Args:
+        state: the run so far.
+        rgb: colour (h, w, 3), uint8.
+        depth: depth along the optical axis (h, w) [m], registered to colour; 0 where there is none.
+        t: time of the frame [s], later than the last one's, on any clock.
+        imu: readings since the last frame, on the same clock: body rate [rad/s] and specific force [m/s^2],
+            gravity in it. They should reach past `t`, or to within a sample of it.
+        donate: write over the map of `state`, which is then no longer usable; spares copying the map.
+
+    Returns:
+        The new state: `state.frames.T_world_body[-1] @ state.T_body_cam` is the camera's pose,
+        `state.frames.status[-1]` how it was found.
+
+    Raises:
+        ValueError: for images of another size, or times that do not increase.
+        DataError: where the first frame has no depth, or an IMU is asked for and there are no readings.
+    """
+    frame = _checked(state, rgb, depth, float(t))
+    if state.config.uses_gyroscope and imu is None and state.imu is None:
+        raise DataError(f"slam.step: imu={state.config.imu!r} needs inertial readings, and there are none")
+    if not donate:
+        state = state._replace(map=jax.tree.map(jnp.copy, state.map))
+    state = _advance(state, frame, float(t), imu, lambda i: _kept_image(state, i))
+    if state.frames.keyframe[-1]:
+        kept = Frame(np.array(frame.rgb), np.array(frame.depth))
+        state = state._replace(images=(*state.images, kept))
+    return state
+
+
+def finish(state: SlamState) -> SlamResult:
+    """The whole run so far: its poses, its map with fine colour, one continuous field through all poses.
+
+    Args:
+        state: a run of at least two frames, made by `step`; it stays usable.
+
+    Raises:
+        DataError: for fewer than two frames.
+    """
+    return _finish(state, lambda i: _kept_image(state, i))
 
 
 def run(
@@ -70,134 +180,212 @@ def run(
     on_frame: Callable[[Progress], None] | None = None,
     state: SlamState | None = None,
 ) -> SlamResult:
-    """Track every frame of an RGB-D recording and map what it sees (paper section 3.4, METHOD section 5).
+    """Track every frame of an RGB-D recording and map what it sees (Ma et al. 2024, section 3.4).
 
-    The world's frame is `first_pose`'s: that of the ground truth, or upright by an accelerometer;
-    `gravity_world` is in it. `state` is where an earlier run stood, to go on from there. Raises DataError
-    where the recording cannot be tracked: fewer than two frames, no depth in the first, IMU asked for and not
-    there.
+    Args:
+        recording: frames with times, and what is known beside them. The world's frame is that of its first
+            true pose, or upright by its accelerometer; `gravity_world` is in it.
+        config: settings of the run.
+        on_frame: called after every frame.
+        state: where an earlier run of the same recording stood, to go on from there.
+
+    Raises:
+        DataError: where the recording cannot be tracked: fewer than two frames, no depth in the first, an IMU
+            asked for and not there.
     """
-    system = make_system(recording, config)
-    state = begin(system) if state is None else state
-    for i in range(state.done, len(recording.t)):
-        started = time.perf_counter()
-        state = step(system, state, recording.read(i))
+    state = begin(recording, config) if state is None else state
+    for i in range(state.frames.count, len(recording.t)):
+        started, t = time.perf_counter(), float(recording.t[i])
+        readings = _readings_until(recording.imu, state.frames.t[-1] if i else -np.inf, t)
+        state = _advance(state, recording.read(i), t, readings, recording.read)
         jax.block_until_ready(state.map)
         state = state._replace(frames=state.frames.put(i, seconds=time.perf_counter() - started))
         if on_frame is not None:
-            on_frame(Progress(i, len(recording.t), state, _truth_error(recording, state)))
-    return _finish(system, state)
+            on_frame(Progress(i, len(recording.t), state, _ground_truth_error(recording, state)))
+    return _finish(state, recording.read)
 
 
-def begin(system: System, size: GridConfig | None = None) -> SlamState:
-    """A run before its first frame, its map of a given size or for what that frame sees."""
-    recording, config = system.recording, system.config
-    frames = no_frames(len(recording.t))
-    T_world_cam = first_pose(recording).T_world_cam
-    frames.T_world_body[0] = T_world_cam @ np.linalg.inv(recording.T_body_cam)
-    if size is None:
-        points = seen_points(recording.read(0), recording, T_world_cam)
-        if len(points) == 0:
-            raise DataError(f"{recording.name}: expected depth in the first frame, found none")
-        size = initial_grid(points, config)
-    key, field_key = jax.random.split(jax.random.key(config.seed))
-    return SlamState(
-        0, frames, np.zeros(6), np.zeros(3), np.zeros(3), GYRO_BIAS_SIGMA, np.zeros(3),
-        jax.jit(system.framed.field.init)(field_key), key, np.ones(3, np.float32), 0.0, size,
-        system.world(size).start(),
-    )  # fmt: skip
+def begin(recording: Recording, config: SlamConfig = _DEFAULT) -> SlamState:
+    """The state of a recording's run before its first frame; DataError as `run` says."""
+    t = recording.t
+    if len(t) < 2:
+        raise DataError(f"{recording.name}: expected at least 2 frames, got {len(t)}")
+    if config.uses_gyroscope:
+        if recording.imu is None:
+            raise DataError(
+                f"{recording.name}: --imu {config.imu} needs inertial readings, and there are none"
+            )
+        first, last = (float(recording.imu.t[k]) for k in (0, -1))
+        if last < t[0] or first > t[-1]:
+            raise DataError(
+                f"{recording.name}: expected inertial readings between {t[0]:.3f} and {t[-1]:.3f} s (the "
+                f"frames), got them between {first:.3f} and {last:.3f} s"
+            )
+    return init(
+        recording.camera,
+        config,
+        T_world_cam=first_pose(recording).T_world_cam,
+        T_body_cam=recording.T_body_cam,
+        gravity_world=recording.gravity_world,
+        duration_s=float(t[-1] - t[0]),
+    )
 
 
-def step(system: System, state: SlamState, frame: Frame) -> SlamState:
+def _advance(state: SlamState, frame: Frame, t: float, imu: Imu | None, read: FrameReader) -> SlamState:
     """The run after one more frame. The map of `state` is written over."""
-    recording, config, i = system.recording, system.config, state.done
+    i, config = state.frames.count, state.config
     generator = np.random.default_rng([config.seed, i])
     key, track_key, map_key = jax.random.split(state.key, 3)
+    state = state._replace(frames=state.frames.appended(t), imu=_joined(state, imu, t), key=key)
     image = to_device(frame)._replace(exposure=state.exposure)
-    if i > 0:
-        state = next_pose(system, state, frame, image, generator, track_key)
-    if system.refit is not None and is_due(i, len(recording.t)):
-        state = _update_intrinsic_frame(system.refit, state, recording.t, i)
-    state = state._replace(done=i + 1, key=key)
-    T_world_cam = state.frames.T_world_body[i] @ recording.T_body_cam
-    points = seen_points(frame, recording, T_world_cam)
-    if len(points) == 0 or not _due(system, state, frame):
+    state = next_pose(state, frame, image, generator, track_key) if i else _first_pose(state)
+    if config.frame == "intrinsic" and is_due(i):
+        state = _update_intrinsic_frame(state)
+    T_world_cam = state.frames.T_world_body[i] @ state.T_body_cam
+    points = seen_points(frame, state.camera, T_world_cam)
+    if i == 0 and len(points) == 0:
+        raise DataError("SLAM: expected depth in the first frame, found none")
+    if len(points) == 0 or not _is_mapped(state, frame):
         return state
     away = np.linalg.norm(points - T_world_cam[:3, 3], axis=1)
-    state = state._replace(far=max(state.far, 1.2 * float(np.percentile(away, 99))))
+    state = state._replace(max_depth=max(state.max_depth, 1.2 * float(np.percentile(away, 99))))
     state = grow_to_fit(points, state)
     image = image._replace(exposure=state.exposure)
-    return map_frame(system.world(state.grid), recording, config, state, image, points, generator, map_key)
+    state = map_frame(state, image, points, read, generator, map_key)
+    if state.frames.keyframe[i]:
+        state = state._replace(thumbnails=np.concatenate([state.thumbnails, thumbnail(frame)[None]]))
+    return state
 
 
-def _update_intrinsic_frame(refit: Refit, state: SlamState, t: Float[np.ndarray, " n"], i: int) -> SlamState:
-    """The state with the intrinsic frame brought to the motions up to frame i."""
-    chosen, poses = window(i), state.frames.T_world_body
-    motions = np.linalg.inv(poses[chosen - 1]) @ poses[chosen]
-    params, T_inner = refit(
-        state.params, jnp.asarray(t[chosen] - t[0], jnp.float32), jnp.asarray(motions, jnp.float32)
+def _first_pose(state: SlamState) -> SlamState:
+    """The state with the first frame's pose: as it was told, or upright by the readings that came with it."""
+    T_world_cam = state.T_world_cam_first
+    if T_world_cam is None:
+        T_world_cam = upright_pose(state.imu, state.frames.t[0], state.T_body_cam, state.gravity_world)
+    return state._replace(
+        frames=state.frames.put(0, T_world_body=T_world_cam @ np.linalg.inv(state.T_body_cam))
     )
-    return state._replace(params=params, frames=state.frames.put(chosen, T_inner=np.asarray(T_inner)))
 
 
-def _due(system: System, state: SlamState, frame: Frame) -> bool:
+def _is_mapped(state: SlamState, frame: Frame) -> bool:
     """Whether the last frame is to be mapped: not where its pose or its colour is in doubt."""
-    config, frames, i = system.config, state.frames, state.done - 1
+    config, frames, i = state.config, state.frames, state.frames.count - 1
     held_out = config.hold_out > 0 and i % config.hold_out == config.hold_out - 1
     mapped = np.flatnonzero(frames.mapped)
-    doubted = frames.lost[i] or frames.appearance_outlier[i]
-    if held_out or doubted or not len(mapped):
-        return not held_out and not doubted
+    if held_out or frames.doubted[i] or not len(mapped):
+        return not held_out and not frames.doubted[i]
     unconfirmed = frames.lost[i - 1] and not config.uses_accelerometer
-    passed = system.recording.t[i] - system.recording.t[mapped[-1]]
+    passed = frames.t[i] - frames.t[mapped[-1]]
     return bool(not unconfirmed and not is_blank(frame) and passed >= config.map_every_s)
 
 
-def _truth_error(recording: Recording, state: SlamState) -> float:
-    if recording.T_world_cam is None:
-        return float("nan")
-    i = state.done - 1
-    estimate = state.frames.T_world_body[i] @ recording.T_body_cam
-    return float(np.linalg.norm(recording.T_world_cam[i, :3, 3] - estimate[:3, 3]))
+def _update_intrinsic_frame(state: SlamState) -> SlamState:
+    """The state with the intrinsic frame brought to the motions so far (Ma et al. 2024, section 3.3)."""
+    frames = state.frames
+    chosen, poses = window(frames.count - 1), frames.T_world_body
+    motions = np.linalg.inv(poses[chosen - 1]) @ poses[chosen]
+    times = (frames.t[chosen] - frames.t[0]) / state.duration_s
+    refit = _refit(state.camera, state.config)
+    params, T_inner = refit(state.params, jnp.asarray(times, jnp.float32), jnp.asarray(motions, jnp.float32))
+    return state._replace(params=params, frames=frames.put(chosen, T_inner=np.asarray(T_inner)))
 
 
-def _finish(system: System, state: SlamState) -> SlamResult:
-    """One field fitted to all poses, and everything that was recorded on the way.
+@lru_cache(maxsize=2)
+def _refit(camera: Camera, config: SlamConfig):
+    framed = framed_field(config)
+    assert framed is not None and framed.parts is not None
+    return make_refit(*framed.parts, angle_of_view(camera)[0])
+
+
+def _finish(state: SlamState, read: FrameReader) -> SlamResult:
+    """One field fitted to all poses, and the map with its texture.
 
     A B-spline with a knot a frame: a PoseNet over the same 12 s of the default room stayed 1.5 cm from the
     poses, and where the camera had turned once around it took the other way.
     """
-    recording, frames = system.recording, state.frames
-    T_world_cam = frames.T_world_body @ recording.T_body_cam
-    t = recording.t - recording.t[0]
-    span = (0.0, float(t[-1]))
+    if state.frames.count < 2:
+        raise DataError(f"SLAM: expected at least 2 frames, got {state.frames.count}")
+    if state.config.frame == "intrinsic" and not is_due(state.frames.count - 1):
+        state = _update_intrinsic_frame(state)
+    frames = state.frames
+    T_world_cam, t = frames.T_world_body @ state.T_body_cam, frames.t - frames.t[0]
     intervals = max(round(t[-1] / float(np.median(np.diff(t)))), 1)
-    field = bspline(span, intervals)
+    field = bspline((0.0, float(t[-1])), intervals)
     start = control_points_along(t, T_world_cam, intervals)
     fitted = fit(field, t, T_world_cam, params=start, steps=400, learning_rate=1e-3)
-    scene, (values,) = system.world(state.grid).scene, scene_params(state.map)
-    keyframes = np.flatnonzero(frames.keyframe)
-    views = read_keyframes(recording, keyframes, T_world_cam)
-    texture = make_texture(state.grid, np.asarray(values[..., 0]), views, recording.camera)
+    assert state.grid is not None and state.map is not None
+    scene, (values,) = map_backend(state).scene, scene_params(state.map)
+    keyframes = keyframe_images(read, np.flatnonzero(frames.keyframe), T_world_cam)
+    texture = make_texture(state.grid, np.asarray(values[..., 0]), keyframes, state.camera)
     return SlamResult(
         T_world_cam,
-        frames.T_inner,
-        lost=frames.lost,
-        uncertain=frames.uncertain,
-        mapped=frames.mapped,
-        iterations=frames.iterations,
-        loss=frames.loss,
-        depth_error=frames.depth_error,
-        colour_error=frames.colour_error,
-        valid=frames.valid,
-        sigma=frames.sigma,
-        seconds=frames.seconds,
+        frames,
         scene=textured(scene, state.grid),
         grid=state.grid,
         scene_params=(values, jax.tree.map(jnp.asarray, texture)),
-        keyframes=keyframes,
         field=field,
         field_params=fitted.params,
         field_rmse_m=float(fitted.translation_rmse_m),
         field_rmse_deg=float(fitted.rotation_rmse_deg),
     )
+
+
+def _joined(state: SlamState, imu: Imu | None, t: float) -> Imu | None:
+    """The readings that the next interval needs: the new ones behind those around the last frame."""
+    if imu is None or not state.config.uses_gyroscope:
+        return state.imu
+    new = Imu(*(np.asarray(x, np.float64) for x in imu))
+    if state.imu is None:
+        return new
+    since = state.frames.t[-1] - _KEPT_S if state.frames.count else -np.inf
+    kept = state.imu.t > since
+    kept[-2:] = True  # however slow the sensor is
+    later = new.t > state.imu.t[-1]
+    return Imu(*(np.concatenate([old[kept], more[later]]) for old, more in zip(state.imu, new, strict=True)))
+
+
+def _readings_until(imu: Imu | None, before: float, t: float) -> Imu | None:
+    """A recording's readings since `before` [s], and one after `t`, as a sensor would give them by then."""
+    if imu is None:
+        return None
+    times = np.asarray(imu.t)
+    first, last = np.searchsorted(times, before, side="right"), np.searchsorted(times, t, side="left") + 1
+    return Imu(*(np.asarray(x)[first:last] for x in imu))
+
+
+def _kept_image(state: SlamState, index: int) -> Frame:
+    """The image of a keyframe that `step` has kept."""
+    return state.images[int(np.searchsorted(np.flatnonzero(state.frames.keyframe), index))]
+
+
+def _checked(state: SlamState, rgb: np.ndarray, depth: np.ndarray, t: float) -> Frame:
+    """The images of a frame as the pipeline has them; ValueError for what does not fit the run."""
+    rgb, depth = np.asarray(rgb), np.asarray(depth)
+    height, width = state.camera.height, state.camera.width
+    if rgb.shape != (height, width, 3) or rgb.dtype != np.uint8:
+        raise ValueError(f"slam.step: expected rgb ({height}, {width}, 3) uint8, got {rgb.shape} {rgb.dtype}")
+    if depth.shape != (height, width) or not np.issubdtype(depth.dtype, np.floating):
+        raise ValueError(
+            f"slam.step: expected depth ({height}, {width}) in metres, floating point, "
+            f"got {depth.shape} {depth.dtype}"
+        )
+    if not np.isfinite(t) or (state.frames.count and t <= state.frames.t[-1]):
+        after = f" after {state.frames.t[-1]:.9g}" if state.frames.count else ""
+        raise ValueError(f"slam.step: expected a time [s]{after}, got {t:.9g}")
+    return Frame(rgb, np.where(np.isfinite(depth), depth, 0).astype(np.float32))
+
+
+def _rigid(name: str, T: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+    T = np.asarray(T, np.float64)
+    good = T.shape == (4, 4) and np.isfinite(T).all() and np.allclose(T[3], [0, 0, 0, 1])
+    if not good or np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > 1e-3 or np.linalg.det(T[:3, :3]) < 0:
+        raise ValueError(f"slam.init: expected {name} to be a rigid transform (4, 4), got {T.tolist()}")
+    return T
+
+
+def _ground_truth_error(recording: Recording, state: SlamState) -> float:
+    if recording.T_world_cam is None:
+        return float("nan")
+    i = state.frames.count - 1
+    estimate = state.frames.T_world_body[i] @ recording.T_body_cam
+    return float(np.linalg.norm(recording.T_world_cam[i, :3, 3] - estimate[:3, 3]))

@@ -1,32 +1,71 @@
-"""All that a run goes on from between two frames: what is saved is what is needed."""
+"""State of a SLAM run between two frames. A checkpoint stores exactly this."""
 
+import enum
 from typing import NamedTuple
 
+import jax
 import numpy as np
-from jaxtyping import Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, Int8, PRNGKeyArray
 
+from jaxpose.datasets.types import Frame
 from jaxpose.fields import Params
+from jaxpose.geometry.camera import Camera
+from jaxpose.imu import Imu
 from jaxpose.scenes import GridConfig
+from jaxpose.slam.config import SlamConfig
 from jaxpose.slam.map.photometric import MapState
+
+# Settings are no leaves of a state: a state is a pytree of arrays and numbers.
+jax.tree_util.register_static(SlamConfig)
+jax.tree_util.register_static(GridConfig)
+
+
+class TrackingStatus(enum.IntEnum):
+    """How a frame's pose was found; the higher, the less it is worth."""
+
+    TRACKED = 0  # registered to the map
+    WEAK = 1  # registered, but the image says little of some direction
+    DEAD_RECKONED = 2  # from the IMU alone, over too short a time to be far off
+    APPEARANCE_OUTLIER = 3  # surfaces fit, colours do not: another place, or another light
+    LOST = 4  # registration failed; the pose is the prediction
 
 
 class Frames(NamedTuple):
-    """What is known of every frame of a recording, one row a frame; of those to come NaN, False or 0."""
+    """What is known of every frame so far, a row each; NaN, False or 0 where nothing is."""
 
+    t: Float[np.ndarray, " n"]  # [s] as given, increasing
     T_world_body: Float[np.ndarray, "n 4 4"]
     T_inner: Float[np.ndarray, "n 4 4"]  # motion since the last frame, in the frame `intrinsic`
-    lost: Bool[np.ndarray, " n"]  # tracking failed, the pose is the prediction
-    appearance_outlier: Bool[np.ndarray, " n"]  # surfaces fit, but colours far worse than usual
-    uncertain: Bool[np.ndarray, " n"]  # lost, unlike, reckoned from the IMU, or little to hold on to
+    status: Int8[np.ndarray, " n"]  # TrackingStatus
     mapped: Bool[np.ndarray, " n"]  # the map was made from it
     keyframe: Bool[np.ndarray, " n"]
     iterations: Int[np.ndarray, " n"]
-    loss: Float[np.ndarray, " n"]
+    loss: Float[np.ndarray, " n"]  # of the image, in sigmas
     depth_error: Float[np.ndarray, " n"]  # [m] median
     colour_error: Float[np.ndarray, " n"]  # median, of colours in [0, 1]
-    valid: Float[np.ndarray, " n"]
+    valid: Float[np.ndarray, " n"]  # share of the pixels with depth that the map explains
     sigma: Float[np.ndarray, "n 2"]  # [m, rad] of the pose, by what the image says of it
     seconds: Float[np.ndarray, " n"]  # wall time, compilation included
+
+    @property
+    def count(self) -> int:
+        """How many frames there are."""
+        return len(self.t)
+
+    @property
+    def lost(self) -> Bool[np.ndarray, " n"]:
+        """Registration failed; the pose is the prediction."""
+        return self.status == TrackingStatus.LOST
+
+    @property
+    def doubted(self) -> Bool[np.ndarray, " n"]:
+        """Lost, or unlike the map in colour: nothing is mapped from such a frame."""
+        return self.status >= TrackingStatus.APPEARANCE_OUTLIER
+
+    @property
+    def uncertain(self) -> Bool[np.ndarray, " n"]:
+        """Anything but registered with every direction held by the image."""
+        return self.status != TrackingStatus.TRACKED
 
     def put(self, i: int | Int[np.ndarray, " k"], **values) -> "Frames":
         """The same with other values at a frame, or at some."""
@@ -35,34 +74,21 @@ class Frames(NamedTuple):
             changed[name][i] = value
         return self._replace(**changed)
 
-
-class SlamState(NamedTuple):
-    """A run after `done` frames: a pytree of arrays, but for `grid`, which says how large `map` is."""
-
-    done: int
-    frames: Frames
-    twist: Float[np.ndarray, "6"]  # of the body over the last interval, per second
-    velocity_body: Float[np.ndarray, "3"]  # [m/s] at the last frame
-    gyro_bias: Float[np.ndarray, "3"]  # [rad/s] in the body (`predict.observe_gyro_bias`)
-    gyro_bias_sigma: float
-    accelerometer_bias_world: Float[np.ndarray, "3"]  # [m/s^2] in the world (`predict.observe_acceleration`)
-    params: Params  # of the tracked field
-    key: PRNGKeyArray
-    exposure: Float[np.ndarray, "3"]  # of the last image that was tracked (`observe.Image`)
-    far: float  # [m] how deep the map is
-    grid: GridConfig
-    map: MapState
+    def appended(self, t: float) -> "Frames":
+        """One more frame at `t` [s], of which nothing is known yet."""
+        row = no_frames(np.array([t]))
+        return Frames(*(np.concatenate(pair) for pair in zip(self, row, strict=True)))
 
 
-def no_frames(count: int) -> Frames:
-    """Frames of which nothing is known yet."""
+def no_frames(t: Float[np.ndarray, " n"]) -> Frames:
+    """Frames at times [s] of which nothing is known yet."""
+    count = len(t)
     unknown, no = np.full(count, np.nan), np.zeros(count, bool)
     return Frames(
+        t=np.asarray(t, np.float64),
         T_world_body=np.full((count, 4, 4), np.nan),
         T_inner=np.full((count, 4, 4), np.nan),
-        lost=no,
-        appearance_outlier=no,
-        uncertain=no,
+        status=np.zeros(count, np.int8),
         mapped=no,
         keyframe=no,
         iterations=np.zeros(count, int),
@@ -73,3 +99,39 @@ def no_frames(count: int) -> Frames:
         sigma=np.full((count, 2), np.nan),
         seconds=unknown,
     )
+
+
+class Motion(NamedTuple):
+    """What carries the prediction from one frame to the next."""
+
+    twist: Float[np.ndarray, "6"]  # of the body over the last interval, per second
+    velocity_body: Float[np.ndarray, "3"]  # [m/s] at the last frame
+    gyro_bias: Float[np.ndarray, "3"]  # [rad/s] in the body (`predict.observe_gyro_bias`)
+    gyro_bias_sigma: Float[np.ndarray, ""] | float
+    accelerometer_bias_world: Float[np.ndarray, "3"]  # [m/s^2] (`predict.observe_acceleration`)
+
+
+class SlamState(NamedTuple):
+    """A run after some frames: a pytree, whose settings (`config`, `grid`) are static.
+
+    `init` makes it, `step` advances it, `finish` sums it up. The old state of a step stays usable unless the
+    step was told to donate it.
+    """
+
+    camera: Camera
+    config: SlamConfig
+    T_body_cam: Float[np.ndarray, "4 4"]
+    gravity_world: Float[np.ndarray, "3"]  # [m/s^2]
+    T_world_cam_first: Float[np.ndarray, "4 4"] | None  # None: upright by the first readings
+    duration_s: float  # of the sequence, for the paper's frames of reference; NaN: not known
+    frames: Frames
+    imu: Imu | None  # readings since a little before the last frame
+    motion: Motion
+    params: Params | None  # of the tracked field, where something reads it
+    key: PRNGKeyArray
+    exposure: Float[np.ndarray | Array, "3"]  # of the last registered image (`observation.Image`)
+    max_depth: float  # [m] how deep the map is
+    thumbnails: Float[np.ndarray, "k 2 12 16"]  # of the keyframes (`keyframes.thumbnail`)
+    images: tuple[Frame, ...]  # of the keyframes, where no recording can give them again
+    grid: GridConfig | None  # None: before the first frame
+    map: MapState | None

@@ -52,6 +52,7 @@ class _Reach(NamedTuple):
 
 
 MapSampler = Callable[[Float[Array, "3"]], MapSample]
+MapQuery = Callable[[Params, Any, Float[Array, "3"]], MapSample]  # from scene parameters and fusion state
 
 
 def make_integrate(config: GridConfig, camera: Camera, band: float):

@@ -3,9 +3,8 @@
 `fuse.py` is the other way, and the default.
 """
 
-from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,22 +16,8 @@ from jaxpose.losses import weighted_mean
 from jaxpose.render import Ray, composite, sdf_weights
 from jaxpose.scenes import SceneField
 from jaxpose.scenes.types import Params
-from jaxpose.slam.observation import Image, SampleConfig, depth_sigma, sample_depths, sample_pixels
-
-
-@dataclass(frozen=True)
-class MapConfig:
-    """How the scene is mapped; all but the first is of the method `gradient`."""
-
-    method: Literal["fused", "gradient"] = "fused"
-    pixels: int = 1000  # per iteration, shared by the frames of the window
-    edge: int = 4
-    window: int = 5  # frames: the current one, the last keyframe, and keyframes that overlap
-    iterations: int = 20
-    first_iterations: int = 200
-    learning_rate: float = 2e-3  # of Adam
-    first_rate: float = 5e-3
-    sample: SampleConfig = SampleConfig(front=8, surface=14, behind=0)
+from jaxpose.slam.config import MapConfig
+from jaxpose.slam.observation import Image, depth_sigma, sample_depths, sample_pixels
 
 
 class MapState(NamedTuple):

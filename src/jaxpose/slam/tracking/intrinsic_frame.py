@@ -63,9 +63,9 @@ def make_refit(outer: PoseField, inner: PoseField, angle_of_view: float) -> Refi
     return refit
 
 
-def is_due(i: int, count: int) -> bool:
-    """Whether the intrinsic frame is brought to the motions so far after frame `i` of `count`."""
-    return i > 0 and (i % EVERY == 0 or i == count - 1)
+def is_due(i: int) -> bool:
+    """Whether the intrinsic frame is brought to the motions so far after frame `i`."""
+    return i > 0 and i % EVERY == 0
 
 
 def window(i: int) -> np.ndarray:

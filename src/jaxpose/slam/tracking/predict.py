@@ -10,23 +10,30 @@ from scipy.spatial.transform import Rotation
 
 from jaxpose import imu as inertial
 from jaxpose.geometry import se3
-from jaxpose.imu import Imu
+from jaxpose.imu import Imu, ImuNoise, ResidualSigmas
+from jaxpose.slam.tracking.reference_frames import ReferenceFrame
 
 AHEAD = 8  # timestamps of a predicted motion
 GYRO_BIAS_SIGMA = 0.1  # [rad/s] of a gyroscope of which nothing is known yet
 BEHIND = 3  # frames before the last one that the field keeps to
+_SMALLEST_WINDOW = 16  # readings; windows are padded to powers of two, so that few shapes are compiled
+
+# How well a PoseNet over a few frames follows a hand's motion between them: added to the sensor's own noise.
+FIELD_SIGMAS = ResidualSigmas(loose=0.004, tight=0.1, accelerometer=1.0)
 
 
 class TrackingProblem(NamedTuple):
     """What is known of the motion since the last frame (`ref`) before this frame's image is looked at."""
 
     t: Float[Array, ""]  # [s] of this frame, since the last
-    timestamps: Float[
-        Array, " k"
-    ]  # [s] of the predicted motion, and of the frames before the last (negative)
+    timestamps: Float[Array, " k"]  # [s] of the predicted motion, and of earlier frames (negative)
     T_ref_body: Float[Array, "k 4 4"]
     sigma: Float[Array, "2"]  # [m, rad] how far the prediction for `t` may be off
     readings: "PreintegratedImu"
+    imu_sigmas: ResidualSigmas
+    T_world_ref: Float[Array, "4 4"]
+    T_body_cam: Float[Array, "4 4"]
+    reference_frame: ReferenceFrame
 
 
 class PreintegratedImu(NamedTuple):
@@ -72,6 +79,38 @@ def preintegrate(
         imu, mask, R_ref_body, acceleration_body,
         jnp.concatenate([zero, velocity]), jnp.concatenate([zero, position]),
     )  # fmt: skip
+
+
+def readings_between(
+    imu: Imu | None,
+    start: float,
+    end: float,
+    R_world_ref: Float[np.ndarray, "3 3"],
+    gyro_bias: Float[np.ndarray, "3"],
+    gravity_world: Float[np.ndarray, "3"],
+) -> PreintegratedImu:
+    """The readings between two frames [s], preintegrated; none where the IMU does not cover the interval."""
+    if imu is None or not inertial.covers(imu, start, end):
+        return no_imu()
+    local, mask = inertial.windows(imu, np.array([start, end]))
+    size = max(_SMALLEST_WINDOW, 1 << (mask.shape[1] - 1).bit_length())
+    t, omega, acceleration, used = (
+        np.pad(x[0], [(0, size - mask.shape[1])] + [(0, 0)] * (x.ndim - 2), mode="edge")
+        for x in (*local, mask)
+    )
+    used[mask.shape[1] :] = False
+    local = Imu(t - start, omega - gyro_bias, acceleration)
+    local = Imu(*(jnp.asarray(x, jnp.float32) for x in local))
+    as_float = lambda x: jnp.asarray(x, jnp.float32)
+    return preintegrate(local, jnp.asarray(used), as_float(R_world_ref), as_float(gravity_world))
+
+
+def imu_sigmas(noise: ImuNoise, imu: Imu | None, dt: float) -> ResidualSigmas:
+    """The sensor's noise over an interval of `dt` [s] and the field's own stiffness together."""
+    if imu is None or len(imu.t) < 2:
+        return FIELD_SIGMAS
+    sensor = inertial.residual_sigmas(noise, 1 / float(np.median(np.diff(imu.t))), dt)
+    return ResidualSigmas(*(float(np.hypot(a, b)) for a, b in zip(sensor, FIELD_SIGMAS, strict=True)))
 
 
 def no_imu() -> PreintegratedImu:

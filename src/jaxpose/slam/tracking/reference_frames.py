@@ -5,9 +5,8 @@ reference turns a field into that. What changes from frame to frame is a traced 
 recompiles.
 """
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Literal, NamedTuple
+from typing import NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -16,61 +15,64 @@ from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation
 
 from jaxpose.fields import Params, PoseField, PoseFn, PoseNetConfig, anchored, in_frame, intrinsic, posenet
-
-FrameName = Literal["anchored", "default", "world", "random", "intrinsic"]
+from jaxpose.slam.config import FrameName
 
 
 class ReferenceFrame(NamedTuple):
-    """Where the field stands against the last frame: its reference there, and its clock then."""
+    """Where the field stands against the last frame: its reference there, and its clock."""
 
     T_ref_field: Float[Array, "4 4"]
-    clock: Float[Array, ""]  # [s]
+    clock: Float[Array, ""]  # [s] of the field's time 0, counted back from the last frame
+    rate: Float[Array, ""]  # [1/s] of the field's time, which spans a few units
+
+    def time(self, t: Float[Array, ""]) -> Float[Array, ""]:
+        """The field's time at `t` [s] since the last frame."""
+        return (t + self.clock) * self.rate
 
 
-Motion = Callable[[Params, ReferenceFrame], PoseFn]
+class FramedMotion(Protocol):
+    """From a field's parameters to the body's motion since the last frame, `t [s] -> T_ref_body`."""
+
+    def __call__(self, params: Params, reference_frame: ReferenceFrame) -> PoseFn: ...
 
 
 class FramedField(NamedTuple):
-    """A field in a frame of reference.
-
-    `motion` is the body's since the last frame. `direct` is the same without the anchor: equal to it where
-    the field is the identity at the last frame, and without the anchor's freedom of gauge. `parts` are the
-    outer and the inner field of the frame `intrinsic`.
-    """
+    """A field in a frame of reference; `parts` are the outer and the inner field of the frame `intrinsic`."""
 
     field: PoseField
-    motion: Motion
-    direct: Motion
+    motion: FramedMotion
     parts: tuple[PoseField, PoseField] | None = None
 
 
-def make_field(name: FrameName, config: PoseNetConfig, interval_s: float, duration_s: float) -> FramedField:
-    """The field for a frame of reference of table 9.
+def make_field(name: FrameName, config: PoseNetConfig) -> FramedField:
+    """The field for a frame of reference of Ma et al. 2024, table 9.
 
-    `anchored` is ours: P(f(0))^-1 . P(f(t)), the identity at the last frame by construction, on a clock that
-    starts there and spans a few intervals, so that how fast the field can turn does not depend on the length
-    of the recording. The others are the paper's and read the time of the sequence.
+    `anchored` is not the paper's: P(f(0))^-1 . P(f(t)), the identity at the last frame by construction, on a
+    clock that starts there and spans a few intervals, so that how fast the field can turn does not depend on
+    the length of the recording. The others are the paper's and read the time of the sequence.
     """
     if name == "anchored":
-        field = posenet(replace(config, span=(-4 * interval_s, 4 * interval_s)))
+        field = posenet(replace(config, span=(-4.0, 4.0)))  # intervals
 
         def motion(params, reference_frame):
             zero = jnp.zeros(())
-            return anchored(lambda t: field.pose(params, t), zero, reference_frame.T_ref_field)
+            pose = lambda t: field.pose(params, reference_frame.time(t))
+            return anchored(pose, zero, reference_frame.T_ref_field)
 
-        return FramedField(field, motion, lambda params, reference_frame: lambda t: field.pose(params, t))
+        return FramedField(field, motion)
 
-    net = posenet(replace(config, span=(0.0, duration_s)))
+    net = posenet(replace(config, span=(0.0, 1.0)))  # of the sequence
     field = _held(intrinsic(net, net)) if name == "intrinsic" else net
 
     def motion_in_frame(params, reference_frame):
-        return in_frame(lambda t: field.pose(params, t + reference_frame.clock), reference_frame.T_ref_field)
+        pose = lambda t: field.pose(params, reference_frame.time(t))
+        return in_frame(pose, reference_frame.T_ref_field)
 
-    return FramedField(field, motion_in_frame, motion_in_frame, (net, net) if name == "intrinsic" else None)
+    return FramedField(field, motion_in_frame, (net, net) if name == "intrinsic" else None)
 
 
 def _held(field: PoseField) -> PoseField:
-    """An intrinsic field whose outer part stays as it is: only `reframe.py` changes it."""
+    """An intrinsic field whose outer part stays as it is: only `intrinsic_frame.py` changes it."""
 
     def pose(params, t):
         return field.pose(params | {"outer": jax.lax.stop_gradient(params["outer"])}, t)
@@ -80,18 +82,22 @@ def _held(field: PoseField) -> PoseField:
 
 def reference_frame(
     name: FrameName,
-    t_s: float,
+    *,
+    since_first_s: float,
+    interval_s: float,
+    duration_s: float,
     T_world_ref: np.ndarray,
     T_world_first: np.ndarray,
     generator: np.random.Generator,
 ) -> ReferenceFrame:
-    """The gauge at a last frame at `t_s` seconds: poses of the body there and at the first frame."""
+    """The reference at a last frame, `since_first_s` after the first; both frames by the body's poses."""
     T_ref_field = np.eye(4)
     if name == "world":
         T_ref_field = np.linalg.inv(T_world_ref) @ T_world_first
     elif name == "random":
         T_ref_field = _perturbation(generator)
-    return ReferenceFrame(jnp.asarray(T_ref_field, jnp.float32), jnp.asarray(t_s, jnp.float32))
+    clock, rate = (0.0, 1 / interval_s) if name == "anchored" else (since_first_s, 1 / duration_s)
+    return ReferenceFrame(*(jnp.asarray(x, jnp.float32) for x in (T_ref_field, clock, rate)))
 
 
 def _perturbation(generator: np.random.Generator) -> np.ndarray:

@@ -1,30 +1,77 @@
-"""Second-order alignment of one camera pose to the map: measured points are moved onto its surfaces.
+"""Registration of one frame to the map: measured points are moved onto its surfaces by Gauss-Newton steps.
 
 A point is where a pixel's ray ends at the measured depth; its residual is the signed distance that the map
 has there (Bylow et al. 2013), along the surface's normal, in sigmas. One look-up a pixel takes the place of
 the samples of a rendered ray, and the distance pulls from as far off as the map knows it.
 """
 
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from jaxpose.fields import Params
 from jaxpose.geometry import se3
-from jaxpose.slam.map.integrate import MapSampler
-from jaxpose.slam.observation import Pixels, back_project, depth_sigma
-from jaxpose.slam.tracking.objective import Residuals, TrackConfig, colour_spread, image_loss, median
+from jaxpose.geometry.camera import Camera
+from jaxpose.losses import weighted_mean
+from jaxpose.slam.config import TrackConfig
+from jaxpose.slam.map.integrate import MapQuery, MapSampler
+from jaxpose.slam.observation import Image, Pixels, back_project, depth_sigma, sample_pixels
+from jaxpose.slam.tracking.predict import AHEAD, TrackingProblem
 
 _SETTLED = 2e-4  # [m, rad] a step this small ends the alignment
 _INDEPENDENT = 100.0  # pixels
 _LONGEST = 0.2  # [m, rad] no step is longer
 _FLAT = 0.05  # a distance that changes less along a metre says nothing about the surface
 _DAMPING = 1e-4
+_LEAST_SPREAD = 0.01  # of colours in [0, 1]
 _BRIGHTER = 4.0  # times, at most, that one image is exposed longer than another
 
 
-class Alignment(NamedTuple):
+class Tracked(NamedTuple):
+    """A frame's motion since the last one, and how well it explains the image."""
+
+    T_ref_body: Float[Array, "4 4"]
+    params: Params | None  # of the field, where it was brought to the frame
+    loss: Float[Array, ""]  # of the image, in sigmas
+    depth_error: Float[Array, ""]  # [m] median over valid pixels
+    colour_error: Float[Array, ""]  # median, of colours in [0, 1]
+    exposure: Float[Array, "3"]  # what its colours are to be multiplied by, to be as bright as the map's
+    valid: Float[Array, ""]  # share of pixels with depth that the map explains
+    iterations: Int[Array, ""]
+    sigma: Float[Array, "2"]  # [m, rad] of the pose, by what the image says of it; NaN: not known
+
+
+class TrackStep(Protocol):
+    """A compiled step from what is expected of a frame, and its image, to its pose."""
+
+    def __call__(
+        self,
+        scene_params: Params,
+        fusion_state: Any,
+        params: Params | None,
+        problem: TrackingProblem,
+        image: Image,
+        max_depth: Float[Array, ""],
+        key: PRNGKeyArray,
+    ) -> Tracked: ...
+
+
+class Residuals(NamedTuple):
+    """Rendered minus measured at pixels, each in its sigmas, and which pixels count."""
+
+    depth: Float[Array, " n"]
+    colour: Float[Array, "n 3"]
+    inlier: Float[Array, " n"]  # 1 or 0, without gradient
+    depth_error: Float[Array, ""]  # [m] median over explained pixels
+    colour_error: Float[Array, ""]  # median over pixels that count, of colours in [0, 1]
+    exposure: Float[Array, "3"]  # what the colours were multiplied by to be as bright as the map's
+    valid: Float[Array, ""]  # share of the pixels with depth that the map explains
+
+
+class Registration(NamedTuple):
     """A pose, how well it explains the image, and the information the image holds about it."""
 
     T_world_cam: Float[Array, "4 4"]
@@ -116,14 +163,14 @@ def exposure(
     return jnp.clip(ratio, 1 / _BRIGHTER, _BRIGHTER)
 
 
-def align(
+def register(
     sample_map: MapSampler,
     T_world_cam: Float[Array, "4 4"],
     T_world_predicted: Float[Array, "4 4"],
     sigma: Float[Array, "2"],
     pixels: Pixels,
     config: TrackConfig,
-) -> Alignment:
+) -> Registration:
     """The pose near a start that brings measured points onto the map's surface, by Gauss-Newton steps.
 
     Residuals count by their size, within one sigma by their square: by squares throughout, a camera between
@@ -154,7 +201,7 @@ def align(
         length = jnp.linalg.norm(step)
         step = step * jnp.minimum(1, _LONGEST / jnp.maximum(length, 1e-12))
         T = se3.compose(at.T_world_cam, se3.exp(step))
-        return Alignment(T, information, image_loss(found, config), found, at.iterations + 1), length
+        return Registration(T, information, image_loss(found, config), found, at.iterations + 1), length
 
     def unsettled(carry):
         at, length = carry
@@ -165,11 +212,11 @@ def align(
     nothing = Residuals(
         jnp.zeros(count), jnp.zeros((count, 3)), jnp.zeros(count), zero, zero, jnp.ones(3), zero
     )
-    start = Alignment(T_world_cam, jnp.zeros((6, 6)), jnp.zeros(()), nothing, jnp.int32(0))
+    start = Registration(T_world_cam, jnp.zeros((6, 6)), jnp.zeros(()), nothing, jnp.int32(0))
     return jax.lax.while_loop(unsettled, improve, (start, jnp.inf))[0]
 
 
-def pose_sigma(found: Alignment) -> Float[Array, "2"]:
+def pose_sigma(found: Registration) -> Float[Array, "2"]:
     """Standard deviation [m, rad] of an aligned pose along its worst axis, by the image alone."""
     covariance = jnp.linalg.inv(found.information / _weight(found.residuals) + 1e-6 * jnp.eye(6))
     worst = lambda block: jnp.sqrt(jnp.linalg.eigvalsh(block)[-1])
@@ -179,3 +226,55 @@ def pose_sigma(found: Alignment) -> Float[Array, "2"]:
 def _weight(found: Residuals) -> Float[Array, ""]:
     """How many times its own worth a pixel would count if none went together with another."""
     return jnp.maximum(jnp.sum(found.inlier), 1) / _INDEPENDENT
+
+
+def make_register(sample_map: MapQuery, camera: Camera, config: TrackConfig) -> TrackStep:
+    """The compiled `TrackStep` of the method `gauss_newton`."""
+
+    @jax.jit
+    def step(scene_params, fusion_state, params, problem, image, max_depth, key):
+        del max_depth  # nothing is rendered
+        sample = partial(sample_map, scene_params, fusion_state)
+        pixels = sample_pixels(key, image, camera, config.pixels, edge=config.edge)
+        tries = starts(problem.T_ref_body[AHEAD - 1], problem.sigma)
+        T_world_tries = se3.compose(problem.T_world_ref, se3.compose(tries, problem.T_body_cam))
+        start = best_start(sample, T_world_tries, pixels)
+        found = register(sample, start, T_world_tries[0], problem.sigma, pixels, config)
+        T_world_body = se3.compose(found.T_world_cam, se3.inverse(problem.T_body_cam))
+        residuals = found.residuals
+        return Tracked(
+            se3.compose(se3.inverse(problem.T_world_ref), T_world_body),
+            params,
+            found.loss,
+            residuals.depth_error,
+            residuals.colour_error,
+            image.exposure * residuals.exposure,
+            residuals.valid,
+            found.iterations,
+            pose_sigma(found),
+        )
+
+    return step
+
+
+def colour_spread(
+    colour: Float[Array, "n 3"], counts: Bool[Array, " n"]
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """The median size of residuals of colour over the pixels that count, and what they are divided by."""
+    error = median(jnp.mean(jnp.abs(colour), axis=-1), counts)
+    return error, jnp.maximum(error, _LEAST_SPREAD)
+
+
+def image_loss(residuals: Residuals, config: TrackConfig) -> Float[Array, ""]:
+    """The L1 loss of depth and colour, means over the pixels that count."""
+    colour = jnp.mean(jnp.abs(residuals.colour), axis=-1)
+    return weighted_mean(jnp.abs(residuals.depth), residuals.inlier) + config.colour_weight * weighted_mean(
+        colour, residuals.inlier
+    )
+
+
+def median(x: Float[Array, " n"], mask: Bool[Array, " n"]) -> Float[Array, ""]:
+    """Median over the masked entries, without gradient; 0 when there are none."""
+    ordered = jnp.sort(jnp.where(mask, jax.lax.stop_gradient(x), jnp.inf))
+    middle = ordered[jnp.maximum(jnp.sum(mask) - 1, 0) // 2]
+    return jnp.where(jnp.any(mask), middle, 0.0)

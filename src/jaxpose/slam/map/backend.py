@@ -1,0 +1,173 @@
+"""The map of a run behind one interface: compiled steps for its size, growth, and mapping a frame."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import lru_cache, partial
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from jaxpose.datasets.types import Frame
+from jaxpose.geometry.camera import Camera, pixel_grid, unproject_numpy
+from jaxpose.scenes import GridConfig, SceneField, bounding_grid, grid, grow, merge
+from jaxpose.scenes.types import Params
+from jaxpose.slam.config import IMU_WEIGHTS, MapConfig, SlamConfig, TrackConfig
+from jaxpose.slam.keyframes import FrameReader, choose, keyframe_images, overlap
+from jaxpose.slam.map.integrate import make_integrate, sample_map
+from jaxpose.slam.map.photometric import MapState, make_descend
+from jaxpose.slam.observation import Image, sample_pixels
+from jaxpose.slam.tracking.gradient import make_gradient
+from jaxpose.slam.tracking.reference_frames import FramedField, make_field
+from jaxpose.slam.tracking.register import TrackStep, make_register
+from jaxpose.slam.tracking.relocalise import relocalise
+from jaxpose.slam.types import SlamState
+
+_SEARCHED_WITH = 400  # pixels
+
+
+class RelocaliseStep(Protocol):
+    """A compiled search from poses `T_world_cam` (k, 4, 4), `sigma` [m, rad] around each, to the best one."""
+
+    def __call__(
+        self,
+        scene_params: Params,
+        fusion_state: Any,
+        T_world_cam: Float[Array, "k 4 4"],
+        sigma: Float[Array, "2"],
+        image: Image,
+        key: PRNGKeyArray,
+    ) -> Float[Array, "4 4"]: ...
+
+
+class MapBackend(NamedTuple):
+    """A scene, and the steps compiled for the size of its grid."""
+
+    scene: SceneField
+    start: Callable[[], MapState]
+    update: Callable[..., Any]
+    track: TrackStep
+    relocalise: RelocaliseStep
+
+
+def map_backend(state: SlamState) -> MapBackend:
+    """The steps for the state's camera, settings and grid, compiled once for all runs that share them."""
+    config, size = state.config, state.grid
+    assert size is not None
+    framed = framed_field(config)
+    weights = IMU_WEIGHTS[config.imu] if config.track.method == "gradient" else IMU_WEIGHTS["none"]
+    return _map_backend(state.camera, config.track, config.map, framed, weights, size)
+
+
+def framed_field(config: SlamConfig) -> FramedField | None:
+    """The PoseNet in its frame of reference; None where nothing reads it."""
+    return _framed_field(config.frame, config.field) if config.uses_field else None
+
+
+_framed_field = lru_cache(maxsize=4)(make_field)
+
+
+@lru_cache(maxsize=2)
+def _map_backend(
+    camera: Camera,
+    track: TrackConfig,
+    config: MapConfig,
+    framed: FramedField | None,
+    weights,
+    size: GridConfig,
+) -> MapBackend:
+    scene = grid(size)
+    scale = {"band": size.truncation, "width": size.truncation / 8}
+    fused = config.method == "fused"
+    if fused:
+        init_map, update = make_integrate(size, camera, size.truncation)
+    else:
+        config = replace(config, sample=replace(config.sample, **scale))
+        init_map, update = make_descend(scene, camera, config)
+    track = replace(track, sample=replace(track.sample, **scale))
+    sample = partial(sample_map, scene, size, fused)
+    if track.method == "gauss_newton":
+        step = make_register(sample, camera, track)
+    else:
+        assert framed is not None
+        step = make_gradient(scene, framed, camera, track, weights)
+
+    @jax.jit
+    def search(scene_params, fusion_state, T_world_cam, sigma, image, key):
+        pixel_key, key = jax.random.split(key)
+        pixels = sample_pixels(pixel_key, image, camera, _SEARCHED_WITH, edge=track.edge)
+        return relocalise(partial(sample, scene_params, fusion_state), T_world_cam, sigma, pixels, key)
+
+    start = lambda: init_map(scene.init(jax.random.key(0)))
+    return MapBackend(scene, start, update, step, search)
+
+
+def scene_params(state: MapState) -> Params:
+    """The map as it is queried: one level."""
+    return state.params if len(state.params) == 1 else _merge(state.params)
+
+
+_merge = jax.jit(merge)
+
+
+def seen_points(
+    frame: Frame, camera: Camera, T_world_cam: Float[np.ndarray, "4 4"], *, step: int = 16
+) -> Float[np.ndarray, "n 3"]:
+    """World points of every `step`-th pixel in both directions that has depth, float64."""
+    pixel = pixel_grid(camera, step)
+    depth = frame.depth[step // 2 :: step, step // 2 :: step]
+    seen = depth > 0
+    points = unproject_numpy(camera, pixel[seen]) * depth[seen][:, None]
+    return points @ T_world_cam[:3, :3].T + T_world_cam[:3, 3]
+
+
+def grow_to_fit(points: Float[np.ndarray, "n 3"], state: SlamState) -> SlamState:
+    """The state with a grid that holds the points; a few stray ones do not make it grow."""
+    bounds = np.percentile(points, [1, 99], axis=0)
+    if state.grid is None:
+        levels = 1 if state.config.map.method == "fused" else 2
+        state = state._replace(grid=bounding_grid(bounds, voxel=state.config.voxel, levels=levels))
+        return state._replace(map=map_backend(state).start())
+    lower, upper = bounds
+    if (lower >= state.grid.lower).all() and (upper <= state.grid.upper).all():
+        return state
+    larger, grown = grow(state.grid, state.map, bounds)
+    return state._replace(grid=larger, map=grown)
+
+
+def map_frame(
+    state: SlamState,
+    image: Image,
+    points: Float[np.ndarray, "n 3"],
+    read: FrameReader,
+    generator: np.random.Generator,
+    key: PRNGKeyArray,
+) -> SlamState:
+    """The state after mapping its last frame, which sees `points`, and keyframes that overlap it."""
+    config, frames, i = state.config, state.frames, state.frames.count - 1
+    backend, T_world_cam = map_backend(state), frames.T_world_body @ state.T_body_cam
+    kept = np.flatnonzero(frames.keyframe)
+    shares = overlap(points, T_world_cam[kept], state.camera) if len(kept) else np.zeros(0)
+    if config.map.method == "fused":
+        updated = backend.update(state.map, image, jnp.asarray(T_world_cam[i], jnp.float32))
+    else:
+        image = image._replace(exposure=np.ones(3, np.float32))  # as that of keyframes
+        images, poses = [image] * config.map.window, [T_world_cam[i]] * config.map.window
+        if len(kept):
+            others = kept[choose(shares, config.map.window - 1, generator)]
+            images = [image, *(k.image for k in keyframe_images(read, others, T_world_cam))]
+            poses = [T_world_cam[i], *T_world_cam[others]]
+        first = not len(kept)
+        updated, _ = backend.update(
+            state.map,
+            jax.tree.map(lambda *x: jnp.stack(x), *images),
+            jnp.asarray(np.stack(poses), jnp.float32),
+            jnp.float32(state.max_depth),
+            jnp.float32(config.map.first_rate if first else config.map.learning_rate),
+            jnp.int32(config.map.first_iterations if first else config.map.iterations),
+            key,
+        )
+    is_new = not len(kept) or shares.max() < config.keyframe_overlap
+    return state._replace(map=updated, frames=frames.put(i, mapped=True, keyframe=is_new))
