@@ -21,7 +21,7 @@ from tracking import FIELDS, make_loss, room
 from jaxpose.fields import posenet, project_onto_poses
 from jaxpose.geometry import se3
 from jaxpose.geometry.rigid import rotation_angle_deg
-from jaxpose.slam.tracking.objective import TrackConfig
+from jaxpose.slam.config import TrackConfig
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,10 @@ from jaxpose.fields import PoseNetConfig, posenet
 from jaxpose.geometry import se3
 from jaxpose.geometry.camera import Camera, pixel_grid, unproject_numpy
 from jaxpose.scenes import bounding_grid, grid, node_positions
-from jaxpose.slam.observation import SampleConfig, sample_pixels, to_device
-from jaxpose.slam.tracking.objective import TrackConfig, image_loss, image_residuals
+from jaxpose.slam.config import SampleConfig, TrackConfig
+from jaxpose.slam.observation import sample_pixels, to_device
+from jaxpose.slam.tracking.gradient import image_residuals
+from jaxpose.slam.tracking.register import image_loss
 
 CAMERA = Camera(585.0, 585.0, 320.0, 240.0, 640, 480)
 FIELDS = {

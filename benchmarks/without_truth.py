@@ -30,10 +30,10 @@ def main() -> None:
     ate = trajectory_error.ate(result.T_world_cam, ground_truth)
     moved, moved_true = (np.linalg.inv(T[:-1]) @ T[1:] for T in (result.T_world_cam, ground_truth))
     right = np.linalg.norm((moved - moved_true)[:, :3, 3], axis=1) < RIGHT
-    ratio = result.colour_error[1:] / np.nanmedian(result.colour_error)
+    ratio = result.frames.colour_error[1:] / np.nanmedian(result.frames.colour_error)
     print(f"{recording.name}, {len(recording.t)} frames, IMU {config.slam.imu}, seed {config.slam.seed}")
     print(f"  tilt {np.rad2deg(np.arccos(min(up, 1.0))):.2f} deg, ATE {100 * ate.rmse:.2f} cm")
-    print(f"  {result.lost.sum()} frames lost, {result.uncertain.sum()} uncertain")
+    print(f"  {result.frames.lost.sum()} frames lost, {result.frames.uncertain.sum()} uncertain")
     print(f"  colour at {right.sum()} right motions: at most {np.nanmax(ratio[right]):.2f} times the median")
     if not right.all():
         print(f"  colour at the others: {np.round(ratio[~right], 2).tolist()}")

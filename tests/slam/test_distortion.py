@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from jaxpose.datasets.types import Frame, Recording
 from jaxpose.geometry.camera import Camera
+from jaxpose.slam import SlamConfig, run
 from jaxpose.slam.keyframes import overlap
-from jaxpose.slam.map.world import seen_points
-from jaxpose.slam.pipeline import SlamConfig, run
+from jaxpose.slam.map.backend import seen_points
 
 CAMERA = Camera(48.8, 48.6, 39.0, 30.5, 80, 60, EUROC_CAM0)
 COUNT = 6
@@ -41,7 +41,7 @@ RECORDING = Recording("box", CAMERA, np.arange(COUNT) / 5, read, T_WORLD_CAM)
 
 @pytest.mark.parametrize("i", [0, COUNT - 1])
 def test_points_that_a_frame_sees_are_on_the_walls(i):
-    points = seen_points(read(i), RECORDING, T_WORLD_CAM[i], step=4)
+    points = seen_points(read(i), CAMERA, T_WORLD_CAM[i], step=4)
     np.testing.assert_allclose(points, seen(i)[1][2::4, 2::4].reshape(-1, 3), atol=1e-5)
 
 
@@ -60,11 +60,11 @@ def test_overlap_is_the_share_of_points_that_the_lens_puts_into_the_image():
 def test_a_run_tracks_and_its_map_holds_all_that_was_seen():
     states = []
     result = run(RECORDING, SlamConfig(voxel=0.1), on_frame=lambda progress: states.append(progress.state))
-    assert not result.lost.any()
+    assert not result.frames.lost.any()
     assert np.linalg.norm(result.T_world_cam[:, :3, 3] - T_WORLD_CAM[:, :3, 3], axis=1).max() < 0.01
     points = np.concatenate([seen(i)[1].reshape(-1, 3) for i in range(COUNT)])
     lower, upper = np.percentile(points, [1, 99], axis=0)
     assert (result.grid.lower <= lower).all() and (upper <= result.grid.upper).all()
     rays = [seen(i)[1][8::16, 8::16] - T_WORLD_CAM[i, :3, 3] for i in range(COUNT)]
     farthest = max(np.percentile(np.linalg.norm(ray, axis=-1), 99) for ray in rays)
-    assert states[-1].far == pytest.approx(1.2 * farthest, rel=0.01)
+    assert states[-1].max_depth == pytest.approx(1.2 * farthest, rel=0.01)

@@ -8,14 +8,12 @@ import sys
 import numpy as np
 import pytest
 
+from jaxpose.datasets.types import select
 from jaxpose.errors import DataError
 from jaxpose.experiments import rgbd_slam
 from jaxpose.experiments.slam.options import load, slam_config
 from jaxpose.files import trajectories
-from jaxpose.slam import checkpoint
-from jaxpose.slam.map.photometric import MapConfig
-from jaxpose.slam.pipeline import SlamConfig, begin
-from jaxpose.slam.system import make_system
+from jaxpose.slam import MapConfig, SlamConfig, TrackingStatus, checkpoint, run
 
 KILLED = """
 import os, signal, sys
@@ -42,7 +40,7 @@ def test_a_killed_run_goes_on_and_ends_as_if_nothing_had_been(tmp_path):
     left = {path.name for path in (tmp_path / "killed").iterdir()}
     assert {"checkpoint.npz", "settings.json", "preview.png"} <= left and "results.json" not in left
     with np.load(tmp_path / "killed" / "checkpoint.npz") as file:
-        assert file[".done"] == 5 or file[".done"] == 4
+        assert len(file["['state'].frames.t"]) in (4, 5)
     assert run("killed") == 0 and run("whole") == 0
     killed, whole = (
         trajectories.read_tum(tmp_path / name / "trajectory.txt") for name in ("killed", "whole")
@@ -60,21 +58,23 @@ def test_a_killed_run_goes_on_and_ends_as_if_nothing_had_been(tmp_path):
 @pytest.mark.parametrize("method", ["fused", "gradient"])
 def test_a_checkpoint_holds_the_whole_state(method, tmp_path):
     options = rgbd_slam.Config(smoke=True, slam=SlamConfig(voxel=0.2, map=MapConfig(method=method)))
-    system = make_system(load(options).recording, slam_config(options))
-    state = begin(system)._replace(done=3, far=2.5)
-    state = state._replace(frames=state.frames.put(2, lost=True, loss=0.7, sigma=[0.1, 0.2]))
+    recording, config = load(options).recording, slam_config(options)
+    states = []
+    run(select(recording, np.arange(3)), config, on_frame=lambda progress: states.append(progress.state))
+    state = states[-1]._replace(duration_s=recording.t[-1] - recording.t[0], max_depth=2.5)
+    state = state._replace(frames=state.frames.put(2, status=TrackingStatus.LOST, loss=0.7, sigma=[0.1, 0.2]))
     checkpoint.save(tmp_path / "c.npz", state)
-    found = checkpoint.load(tmp_path / "c.npz", system)
-    assert (found.done, found.far, found.grid) == (3, 2.5, state.grid)
+    found = checkpoint.load(tmp_path / "c.npz", recording, config)
+    assert (found.max_depth, found.grid) == (2.5, state.grid)
     for name, value in state.frames._asdict().items():
         np.testing.assert_array_equal(getattr(found.frames, name), value, err_msg=name)
     np.testing.assert_array_equal(found.map.params[0], state.map.params[0])
-    other = make_system(system.recording._replace(t=np.arange(9) / 5), system.config)
-    with pytest.raises(DataError, match="c.npz: expected"):
-        checkpoint.load(tmp_path / "c.npz", other)
+    np.testing.assert_array_equal(found.thumbnails, state.thumbnails)
+    with pytest.raises(DataError, match="c.npz: expected a run over frames at the times of"):
+        checkpoint.load(tmp_path / "c.npz", recording._replace(t=recording.t + 0.1), config)
     (tmp_path / "c.npz").write_bytes(b"PK\3\4 not a checkpoint")
     with pytest.raises(DataError, match="c.npz: expected a checkpoint"):
-        checkpoint.load(tmp_path / "c.npz", system)
+        checkpoint.load(tmp_path / "c.npz", recording, config)
 
 
 def test_other_settings_are_not_resumed(tmp_path):

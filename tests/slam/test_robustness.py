@@ -13,14 +13,14 @@ from jaxpose.datasets.types import Frame, Recording, select
 from jaxpose.evaluation import trajectory_error
 from jaxpose.geometry import se3
 from jaxpose.geometry.camera import Camera
-from jaxpose.slam.keyframes import look
-from jaxpose.slam.pipeline import SlamConfig, run
+from jaxpose.slam import RecoveryConfig, SlamConfig, run
+from jaxpose.slam.keyframes import thumbnail
 from jaxpose.slam.tracker import _distribute_correction, _is_appearance_outlier, _looks_better, _usual
+from jaxpose.slam.tracking.register import Tracked
 from jaxpose.slam.tracking.relocalise import CENTRES, relocalise
-from jaxpose.slam.tracking.steps import Tracked
-from jaxpose.slam.types import no_frames
+from jaxpose.slam.types import Frames, TrackingStatus, no_frames
 
-BAND = 0.3
+BAND, POLICY = 0.3, RecoveryConfig()
 
 
 def truncated_box(point):
@@ -62,10 +62,9 @@ def test_a_search_begins_at_every_centre(find):
 
 
 def test_lost_frames_lead_to_where_the_camera_is_found():
-    t, frames = np.array([0.0, 1.0, 2.0, 4.0]), no_frames(4)
-    frames = frames.put(np.arange(4), T_world_body=np.eye(4), lost=[False, True, True, False])
+    frames = no_frames(np.array([0.0, 1.0, 2.0, 4.0])).put(np.arange(4), T_world_body=np.eye(4))
     correction = np.asarray(se3.exp(jnp.array([0.4, 0.0, 0.0, 0.0, 0.0, 0.8])), np.float64)
-    bent = _distribute_correction(frames, t, 0, 3, correction)
+    bent = _distribute_correction(frames, 0, correction)
     np.testing.assert_array_equal(bent.T_world_body[[0, 3]], np.tile(np.eye(4), (2, 1, 1)))
     for i, share in ((1, 0.25), (2, 0.5)):
         expected = np.asarray(se3.exp(share * jnp.array([0.4, 0.0, 0.0, 0.0, 0.0, 0.8])))
@@ -75,13 +74,15 @@ def test_lost_frames_lead_to_where_the_camera_is_found():
 
 def test_of_two_poses_that_fit_the_surfaces_colour_decides():
     found = Tracked(
-        {}, *np.ones(3), colour_error=0.1, exposure=np.ones(3), valid=0.9, iterations=5, sigma=0.0
+        np.eye(4), None, 1.0, 1.0, colour_error=0.1, exposure=np.ones(3), valid=0.9, iterations=5, sigma=0.0
     )
     better = found._replace(colour_error=0.03)
-    assert _looks_better(better, found) and not _looks_better(found, better)
-    assert not _looks_better(found._replace(colour_error=0.099), found)  # no matter
-    assert not _looks_better(better._replace(valid=0.3), found)  # little in view, which may fit by chance
-    assert not _looks_better(better._replace(loss=2.0), found)  # the surfaces go first
+    assert _looks_better(POLICY, better, found) and not _looks_better(POLICY, found, better)
+    assert not _looks_better(POLICY, found._replace(colour_error=0.099), found)  # no matter
+    assert not _looks_better(
+        POLICY, better._replace(valid=0.3), found
+    )  # little in view, which may fit by chance
+    assert not _looks_better(POLICY, better._replace(loss=2.0), found)  # the surfaces go first
 
 
 def test_what_is_usual_is_that_of_the_last_frames_found():
@@ -93,17 +94,18 @@ def test_what_is_usual_is_that_of_the_last_frames_found():
 
 
 def test_colours_of_another_place_are_doubted_until_they_must_be_another_light():
-    t, frames = np.arange(20) / 4, no_frames(20).put(np.arange(1, 5), colour_error=0.01)
-    assert not _is_appearance_outlier(frames, t, 1, 0.5)  # nothing is usual yet
-    assert not _is_appearance_outlier(frames, t, 5, 0.024) and _is_appearance_outlier(frames, t, 5, 0.026)
-    frames = frames.put(np.arange(5, 12), colour_error=0.1, appearance_outlier=True)
-    assert _is_appearance_outlier(frames, t, 11, 0.1) and not _is_appearance_outlier(
-        frames, t, 12, 0.1
-    )  # 2 s after frame 4
+    def is_outlier(frames, i, colour_error):
+        return _is_appearance_outlier(POLICY, Frames(*(x[: i + 1] for x in frames)), colour_error)
+
+    frames = no_frames(np.arange(20) / 4).put(np.arange(1, 5), colour_error=0.01)
+    assert not is_outlier(frames, 1, 0.5)  # nothing is usual yet
+    assert not is_outlier(frames, 5, 0.024) and is_outlier(frames, 5, 0.026)
+    frames = frames.put(np.arange(5, 12), colour_error=0.1, status=TrackingStatus.APPEARANCE_OUTLIER)
+    assert is_outlier(frames, 11, 0.1) and not is_outlier(frames, 12, 0.1)  # 2 s after frame 4
     frames = frames.put(12, colour_error=0.1)
-    assert not _is_appearance_outlier(frames, t, 13, 0.2) and _is_appearance_outlier(frames, t, 13, 0.26)
-    clean = no_frames(20).put(np.arange(1, 5), colour_error=0.001)
-    assert not _is_appearance_outlier(clean, t, 5, 0.019) and _is_appearance_outlier(clean, t, 5, 0.021)
+    assert not is_outlier(frames, 13, 0.2) and is_outlier(frames, 13, 0.26)
+    clean = no_frames(np.arange(20) / 4).put(np.arange(1, 5), colour_error=0.001)
+    assert not is_outlier(clean, 5, 0.019) and is_outlier(clean, 5, 0.021)
 
 
 def test_a_frame_looks_like_itself_in_another_light():
@@ -113,9 +115,9 @@ def test_a_frame_looks_like_itself_in_another_light():
     frame = Frame(rgb.astype(np.uint8), np.kron(rng.uniform(1, 3, (12, 16)), np.ones((5, 5))))
     brighter = frame._replace(rgb=(2 * rgb).astype(np.uint8))
     other = Frame(frame.rgb[::-1], frame.depth[:, ::-1])
-    difference = lambda a, b: np.mean((look(a) - look(b)) ** 2)
+    difference = lambda a, b: np.mean((thumbnail(a) - thumbnail(b)) ** 2)
     assert difference(frame, brighter) < 0.01 < 1 < difference(frame, other)
-    assert np.isfinite(look(Frame(0 * frame.rgb, 0 * frame.depth))).all()
+    assert np.isfinite(thumbnail(Frame(0 * frame.rgb, 0 * frame.depth))).all()
 
 
 @pytest.fixture(scope="module")
@@ -139,9 +141,15 @@ def test_a_camera_that_comes_back_is_recognised_without_an_imu(walk):
     indices = np.concatenate([np.arange(12), np.arange(12, 22), np.arange(4, 12)])
     back = select(walk, indices)._replace(t=np.arange(len(indices)) / 5, imu=None)
     result = run(blacked_out(back, range(12, 22)))
-    assert result.lost[12:22].all() and not result.lost[:12].any() and not result.lost[22:].any()
-    assert not result.mapped[12:23].any() and result.mapped[24:].any()  # the first found is not mapped yet
-    assert result.uncertain[12:22].all()
+    assert (
+        result.frames.lost[12:22].all()
+        and not result.frames.lost[:12].any()
+        and not result.frames.lost[22:].any()
+    )
+    assert (
+        not result.frames.mapped[12:23].any() and result.frames.mapped[24:].any()
+    )  # the first found is not mapped yet
+    assert result.frames.uncertain[12:22].all()
     ground_truth = back.T_world_cam
     assert ground_truth is not None
     error = np.linalg.norm(result.T_world_cam[23:, :3, 3] - ground_truth[23:, :3, 3], axis=1)
@@ -151,8 +159,8 @@ def test_a_camera_that_comes_back_is_recognised_without_an_imu(walk):
 @pytest.mark.slow
 def test_an_imu_bridges_two_seconds_of_darkness(walk):
     result = run(blacked_out(walk, range(10, 20)), SlamConfig(imu="combined"))
-    assert result.lost[10:20].all() and not result.lost[21:].any()
-    assert result.uncertain[10:20].all() and result.mapped[20:].any()
+    assert result.frames.lost[10:20].all() and not result.frames.lost[21:].any()
+    assert result.frames.uncertain[10:20].all() and result.frames.mapped[20:].any()
     ground_truth = walk.T_world_cam
     assert ground_truth is not None
     error = np.linalg.norm(result.T_world_cam[:, :3, 3] - ground_truth[:, :3, 3], axis=1)
@@ -164,7 +172,7 @@ def test_without_true_poses_the_readings_find_their_gravity(walk):
     ground_truth = walk.T_world_cam
     assert ground_truth is not None
     result = run(walk._replace(T_world_cam=None), SlamConfig(imu="combined"))
-    assert not result.lost.any() and trajectory_error.ate(result.T_world_cam, ground_truth).rmse < 0.02
+    assert not result.frames.lost.any() and trajectory_error.ate(result.T_world_cam, ground_truth).rmse < 0.02
     up = (result.T_world_cam @ np.linalg.inv(ground_truth))[:, :3, 2]
     assert (np.rad2deg(np.arccos(up[:, 2])) < 3).all()
 
@@ -204,7 +212,7 @@ def test_bad_frames_are_survived(walk, fault, imu):
 
     result = run(walk._replace(read=read), SlamConfig(imu=imu))
     empty = [i for i in range(len(walk.t)) if not read(i).depth.any()]
-    assert set(np.flatnonzero(result.lost)) <= set(empty) and result.uncertain[empty].all()
+    assert set(np.flatnonzero(result.frames.lost)) <= set(empty) and result.frames.uncertain[empty].all()
     assert trajectory_error.ate(result.T_world_cam, walk.T_world_cam).rmse < 0.03
 
 
@@ -217,9 +225,16 @@ def test_a_lamp_that_goes_out_is_survived(walk):
         return frame._replace(rgb=frame.rgb // 10) if i >= 10 else frame
 
     result = run(walk._replace(read=read))
-    assert not result.lost.any() and trajectory_error.ate(result.T_world_cam, walk.T_world_cam).rmse < 0.03
-    assert result.uncertain[10] and not result.uncertain[:10].any() and not result.uncertain[20:].any()
-    assert not result.mapped[result.uncertain].any() and result.mapped[20:].any()
+    assert (
+        not result.frames.lost.any()
+        and trajectory_error.ate(result.T_world_cam, walk.T_world_cam).rmse < 0.03
+    )
+    assert (
+        result.frames.uncertain[10]
+        and not result.frames.uncertain[:10].any()
+        and not result.frames.uncertain[20:].any()
+    )
+    assert not result.frames.mapped[result.frames.uncertain].any() and result.frames.mapped[20:].any()
 
 
 @pytest.mark.slow
@@ -227,7 +242,10 @@ def test_dropped_frames_are_survived(walk):
     kept = np.flatnonzero(np.random.default_rng(1).uniform(size=len(walk.t)) > 0.3)
     some = select(walk, np.union1d([0], kept))
     result = run(some, SlamConfig(imu="combined"))
-    assert not result.lost.any() and trajectory_error.ate(result.T_world_cam, some.T_world_cam).rmse < 0.02
+    assert (
+        not result.frames.lost.any()
+        and trajectory_error.ate(result.T_world_cam, some.T_world_cam).rmse < 0.02
+    )
 
 
 @pytest.mark.slow
@@ -251,7 +269,7 @@ def test_a_camera_before_a_floor_of_planks_does_not_settle_a_plank_away(exposed)
         )
 
     result = run(Recording("planks", camera, np.arange(6) / 5, read, T), SlamConfig(voxel=0.03))
-    assert not result.lost.any()
+    assert not result.frames.lost.any()
     assert np.linalg.norm(result.T_world_cam[:, :3, 3] - T[:, :3, 3], axis=1).max() < 0.02
 
 

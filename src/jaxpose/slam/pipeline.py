@@ -100,7 +100,6 @@ def init(
     if config.uses_field and config.frame != "anchored" and duration_s is None:
         raise ValueError(f"slam.init: frame {config.frame} expected duration_s [s] of the sequence, got None")
     framed = framed_field(config)
-    key, field_key = jax.random.split(jax.random.key(config.seed))
     return SlamState(
         camera=camera,
         config=config,
@@ -111,8 +110,7 @@ def init(
         frames=no_frames(np.zeros(0)),
         imu=None,
         motion=Motion(np.zeros(6), np.zeros(3), np.zeros(3), GYRO_BIAS_SIGMA, np.zeros(3)),
-        params=None if framed is None else jax.jit(framed.field.init)(field_key),
-        key=key,
+        params=None if framed is None else jax.jit(framed.field.init)(jax.random.key(config.seed)),
         exposure=np.ones(3, np.float32),
         max_depth=0.0,
         thumbnails=np.zeros((0, 2, 12, 16)),
@@ -155,7 +153,8 @@ def step(
         raise DataError(f"slam.step: imu={state.config.imu!r} needs inertial readings, and there are none")
     if not donate:
         state = state._replace(map=jax.tree.map(jnp.copy, state.map))
-    state = _advance(state, frame, float(t), imu, lambda i: _kept_image(state, i))
+    before = state
+    state = _advance(before, frame, float(t), imu, lambda i: _kept_image(before, i))
     if state.frames.keyframe[-1]:
         kept = Frame(np.array(frame.rgb), np.array(frame.depth))
         state = state._replace(images=(*state.images, kept))
@@ -197,7 +196,10 @@ def run(
     for i in range(state.frames.count, len(recording.t)):
         started, t = time.perf_counter(), float(recording.t[i])
         readings = _readings_until(recording.imu, state.frames.t[-1] if i else -np.inf, t)
-        state = _advance(state, recording.read(i), t, readings, recording.read)
+        try:
+            state = _advance(state, recording.read(i), t, readings, recording.read)
+        except DataError as error:
+            raise DataError(f"{recording.name}: {error}") from None
         jax.block_until_ready(state.map)
         state = state._replace(frames=state.frames.put(i, seconds=time.perf_counter() - started))
         if on_frame is not None:
@@ -235,8 +237,8 @@ def _advance(state: SlamState, frame: Frame, t: float, imu: Imu | None, read: Fr
     """The run after one more frame. The map of `state` is written over."""
     i, config = state.frames.count, state.config
     generator = np.random.default_rng([config.seed, i])
-    key, track_key, map_key = jax.random.split(state.key, 3)
-    state = state._replace(frames=state.frames.appended(t), imu=_joined(state, imu, t), key=key)
+    track_key, map_key = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), i))
+    state = state._replace(frames=state.frames.appended(t), imu=_joined(state, imu))
     image = to_device(frame)._replace(exposure=state.exposure)
     state = next_pose(state, frame, image, generator, track_key) if i else _first_pose(state)
     if config.frame == "intrinsic" and is_due(i):
@@ -244,7 +246,7 @@ def _advance(state: SlamState, frame: Frame, t: float, imu: Imu | None, read: Fr
     T_world_cam = state.frames.T_world_body[i] @ state.T_body_cam
     points = seen_points(frame, state.camera, T_world_cam)
     if i == 0 and len(points) == 0:
-        raise DataError("SLAM: expected depth in the first frame, found none")
+        raise DataError("expected depth in the first frame, found none")
     if len(points) == 0 or not _is_mapped(state, frame):
         return state
     away = np.linalg.norm(points - T_world_cam[:3, 3], axis=1)
@@ -330,7 +332,7 @@ def _finish(state: SlamState, read: FrameReader) -> SlamResult:
     )
 
 
-def _joined(state: SlamState, imu: Imu | None, t: float) -> Imu | None:
+def _joined(state: SlamState, imu: Imu | None) -> Imu | None:
     """The readings that the next interval needs: the new ones behind those around the last frame."""
     if imu is None or not state.config.uses_gyroscope:
         return state.imu

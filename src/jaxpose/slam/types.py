@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Int8, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, Int8
 
 from jaxpose.datasets.types import Frame
 from jaxpose.fields import Params
@@ -128,7 +128,6 @@ class SlamState(NamedTuple):
     imu: Imu | None  # readings since a little before the last frame
     motion: Motion
     params: Params | None  # of the tracked field, where something reads it
-    key: PRNGKeyArray
     exposure: Float[np.ndarray | Array, "3"]  # of the last registered image (`observation.Image`)
     max_depth: float  # [m] how deep the map is
     thumbnails: Float[np.ndarray, "k 2 12 16"]  # of the keyframes (`keyframes.thumbnail`)

@@ -15,7 +15,7 @@ from jaxpose.plots.preview import preview
 from jaxpose.plots.slam import View
 from jaxpose.scenes import GridConfig, grid
 from jaxpose.slam import checkpoint
-from jaxpose.slam.map.world import scene_params
+from jaxpose.slam.map.backend import scene_params
 from jaxpose.slam.pipeline import Progress
 from jaxpose.slam.types import SlamState
 
@@ -52,7 +52,8 @@ def checkpoint_callback(
 def _preview(
     path: Path, recording: Recording, state: SlamState, viewer: Callable[[GridConfig], map_files.Viewer]
 ) -> None:
-    frames, i = state.frames, state.done - 1
+    frames, i = state.frames, state.frames.count - 1
+    assert state.grid is not None and state.map is not None
     T_world_cam = frames.T_world_body[: i + 1] @ recording.T_body_cam
     frame = recording.read(i)
     pixels = map_files.every(recording.camera, _WIDTH)

@@ -74,18 +74,18 @@ class Measured(NamedTuple):
 
 def cost(result: SlamResult) -> dict[str, Any]:
     """What tracking cost and how it went."""
-    settled = result.seconds[2:]  # the first two compile
+    settled = result.frames.seconds[2:]  # the first two compile
     return {
-        "frames": len(result.lost),
-        "frames_lost": int(result.lost.sum()),
-        "lost": np.flatnonzero(result.lost),
-        "frames_uncertain": int(result.uncertain.sum()),
-        "uncertain": np.flatnonzero(result.uncertain),
-        "pose_sigma_median": _medians(result.sigma),
+        "frames": len(result.frames.lost),
+        "frames_lost": int(result.frames.lost.sum()),
+        "lost": np.flatnonzero(result.frames.lost),
+        "frames_uncertain": int(result.frames.uncertain.sum()),
+        "uncertain": np.flatnonzero(result.frames.uncertain),
+        "pose_sigma_median": _medians(result.frames.sigma),
         "seconds_per_frame": float(np.median(settled)),
-        "seconds_per_frame_mean_with_compilation": float(result.seconds.mean()),
-        "iterations_mean": float(result.iterations[1:].mean()),
-        "depth_error_median_m": trajectory_error.statistics(result.depth_error).median,
+        "seconds_per_frame_mean_with_compilation": float(result.frames.seconds.mean()),
+        "iterations_mean": float(result.frames.iterations[1:].mean()),
+        "depth_error_median_m": trajectory_error.statistics(result.frames.depth_error).median,
         "keyframes": result.keyframes,
         "field_rmse_m": result.field_rmse_m,
         "field_rmse_deg": result.field_rmse_deg,
@@ -94,11 +94,11 @@ def cost(result: SlamResult) -> dict[str, Any]:
 
 def freedom(recording: Recording, result: SlamResult) -> Freedom | None:
     """The effective degrees of freedom before and after (paper figure 6); None but for `intrinsic`."""
-    if not np.isfinite(result.T_inner[1:]).all():
+    if not np.isfinite(result.frames.T_inner[1:]).all():
         return None
     T_world_body = result.T_world_cam @ np.linalg.inv(recording.T_body_cam)
     view = angle_of_view(recording.camera)[0]
-    motions = (np.linalg.inv(T_world_body[:-1]) @ T_world_body[1:], result.T_inner[1:])
+    motions = (np.linalg.inv(T_world_body[:-1]) @ T_world_body[1:], result.frames.T_inner[1:])
     before, after = (np.asarray(effective_dof(jnp.asarray(motion, jnp.float32), view)) for motion in motions)
     numbers = {"threshold": THRESHOLD, "before_mean": float(before.mean()), "after_mean": float(after.mean())}
     return Freedom(before, after, numbers)

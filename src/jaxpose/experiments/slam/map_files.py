@@ -71,7 +71,7 @@ def views(recording: Recording, result: SlamResult, render: Renderer) -> list[Vi
 
     def view(i: int) -> View:
         seen = render(i)
-        lost = ", lost" if result.lost[i] else ""
+        lost = ", lost" if result.frames.lost[i] else ""
         label = f"t = {recording.t[i]:.2f} s{lost}"
         return View(label, seen.photograph, seen.rgb, seen.frame_depth, seen.depth)
 
@@ -80,7 +80,10 @@ def views(recording: Recording, result: SlamResult, render: Renderer) -> list[Vi
 
 def map_quality(result: SlamResult, render: Renderer) -> dict[str, Any]:
     """PSNR [dB] and mean depth error [m] of the map at mapped and at held-out frames; None without such."""
-    kinds = {"mapped": result.mapped & ~result.lost, "held_out": ~result.mapped & ~result.lost}
+    kinds = {
+        "mapped": result.frames.mapped & ~result.frames.lost,
+        "held_out": ~result.frames.mapped & ~result.frames.lost,
+    }
     return {"protocol": PROTOCOL} | {kind: _quality(render, chosen) for kind, chosen in kinds.items()}
 
 

@@ -28,13 +28,12 @@ from jaxpose.files import atomic, run_folder, trajectories
 from jaxpose.files.camera_json import write_camera
 from jaxpose.files.ply import write_ply
 from jaxpose.plots import slam as slam_plots
+from jaxpose.slam import ImuMode, Progress, SlamResult
 from jaxpose.slam.checkpoint import load as load_checkpoint
 from jaxpose.slam.initial_pose import first_pose
-from jaxpose.slam.keyframes import read_keyframes
+from jaxpose.slam.keyframes import keyframe_images
 from jaxpose.slam.map.mesh import mesh, point_cloud
-from jaxpose.slam.pipeline import ImuMode, Progress, SlamResult
 from jaxpose.slam.pipeline import run as track
-from jaxpose.slam.system import make_system
 
 OnFrame = Callable[[ImuMode, Progress], None]
 
@@ -105,7 +104,7 @@ def _single(
         return json.loads(finished.read_text()), _written_errors(folder, recording)
     config, state = slam_config(options), None
     if checkpoint.exists():
-        state = load_checkpoint(checkpoint, make_system(recording, config))
+        state = load_checkpoint(checkpoint, recording, config)
     keep = checkpoint_callback(folder, recording, resume_fingerprint(options))
 
     def done(progress: Progress) -> None:
@@ -171,7 +170,7 @@ def _written_errors(folder: Path, recording: Recording) -> Float[np.ndarray, " n
 
 def _write_surface(folder: Path, recording: Recording, result: SlamResult) -> tuple[str, ...]:
     """The map as a point cloud and, where scikit-image is installed, as a mesh; a note where it is not."""
-    keyframes = partial(read_keyframes, recording, result.keyframes, result.T_world_cam)
+    keyframes = partial(keyframe_images, recording.read, result.keyframes, result.T_world_cam)
     points = point_cloud(keyframes(), recording.camera, result.grid.voxel)
     write_ply(folder / "points.ply", points.points, points.rgb)
     try:
@@ -196,14 +195,19 @@ def _draw(
     name = f"{name}, {len(recording.t)} frames"
     if errors is None:
         title = f"{name}: no ground truth to compare with"
-        slam_plots.trajectory(folder / "trajectory.png", result.T_world_cam, None, result.lost, title)
+        slam_plots.trajectory(folder / "trajectory.png", result.T_world_cam, None, result.frames.lost, title)
     else:
         ate = f"{name}: ATE-RMSE {100 * errors.numbers['ate_rmse_m']:.2f} cm after SE(3) alignment"
         slam_plots.trajectory(
-            folder / "trajectory.png", errors.aligned, recording.T_world_cam, result.lost, ate
+            folder / "trajectory.png", errors.aligned, recording.T_world_cam, result.frames.lost, ate
         )
         slam_plots.errors(
-            folder / "errors.png", recording.t, errors.translation_m, errors.rotation_deg, result.lost, ate
+            folder / "errors.png",
+            recording.t,
+            errors.translation_m,
+            errors.rotation_deg,
+            result.frames.lost,
+            ate,
         )
     slam_plots.renders(
         folder / "renders.png",

@@ -9,7 +9,7 @@ from typing import Any
 from tqdm import tqdm
 
 from jaxpose.experiments.command import markdown_table
-from jaxpose.slam.pipeline import ImuMode, Progress
+from jaxpose.slam import ImuMode, Progress
 
 _COLUMNS: tuple[str, ...] = ("IMU", "ATE [cm]", "RPE [cm]", "RPE [deg]", "frames lost", "s / frame")
 
@@ -34,8 +34,8 @@ def progress_bar() -> Callable[[ImuMode, Progress], None]:
         lost += bool(frames.lost[progress.index])
         loss = float(frames.loss[progress.index])
         state = {"loss": f"{loss:.2f}"} if math.isfinite(loss) else {}  # the first frame has none
-        if math.isfinite(progress.truth_error):
-            state["off"] = f"{100 * progress.truth_error:.1f} cm"
+        if math.isfinite(progress.ground_truth_error):
+            state["off"] = f"{100 * progress.ground_truth_error:.1f} cm"
         bar.set_postfix(state | {"lost": str(lost)}, refresh=False)
         bar.update()
         if progress.index == progress.count - 1:

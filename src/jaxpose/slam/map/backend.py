@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache, partial
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +28,7 @@ from jaxpose.slam.types import SlamState
 _SEARCHED_WITH = 400  # pixels
 
 
+@runtime_checkable
 class RelocaliseStep(Protocol):
     """A compiled search from poses `T_world_cam` (k, 4, 4), `sigma` [m, rad] around each, to the best one."""
 

@@ -6,7 +6,7 @@ recompiles.
 """
 
 from dataclasses import replace
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -30,6 +30,7 @@ class ReferenceFrame(NamedTuple):
         return (t + self.clock) * self.rate
 
 
+@runtime_checkable
 class FramedMotion(Protocol):
     """From a field's parameters to the body's motion since the last frame, `t [s] -> T_ref_body`."""
 

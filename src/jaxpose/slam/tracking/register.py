@@ -6,7 +6,7 @@ the samples of a rendered ray, and the distance pulls from as far off as the map
 """
 
 from functools import partial
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -44,6 +44,7 @@ class Tracked(NamedTuple):
     sigma: Float[Array, "2"]  # [m, rad] of the pose, by what the image says of it; NaN: not known
 
 
+@runtime_checkable
 class TrackStep(Protocol):
     """A compiled step from what is expected of a frame, and its image, to its pose."""
 
