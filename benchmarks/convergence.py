@@ -20,7 +20,7 @@ from tracking import FIELDS, make_loss, room
 
 from jaxpose.fields import posenet, project_onto_poses
 from jaxpose.geometry import se3
-from jaxpose.geometry.rigid import rotation_angle_deg
+from jaxpose.geometry.rigid import rotation_angle
 from jaxpose.slam.config import TrackConfig
 
 
@@ -62,7 +62,7 @@ def make_descent(scene, pose_of, rates, config: Config):
 
 def converged(poses: np.ndarray, config: Config) -> float:
     """The first iteration from which on the poses are near ground truth, which is the identity; inf: none."""
-    angle = rotation_angle_deg(poses[:, :3, :3], np.tile(np.eye(3), (len(poses), 1, 1)))
+    angle = np.degrees(rotation_angle(poses[:, :3, :3], np.eye(3)))
     near = (np.linalg.norm(poses[:, :3, 3], axis=1) < config.metres) & (angle < config.degrees)
     far = np.flatnonzero(~near)
     after = far[-1] + 1 if len(far) else 0

@@ -24,7 +24,7 @@ from jaxpose.datasets.synthetic.furniture import SIZE
 from jaxpose.datasets.synthetic.room_renderer import render, scenery
 from jaxpose.files import trajectories
 from jaxpose.geometry.camera import Camera
-from jaxpose.geometry.rigid import rotation_angle_deg
+from jaxpose.geometry.rigid import rotation_angle
 from jaxpose.imu.simulation import Interpolant, interpolant
 
 FOCAL = 585.0  # [px]
@@ -92,7 +92,7 @@ def main() -> None:
     pinhole = dict(zip(camera._fields[:6], camera[:6], strict=True))
     (config.out / "intrinsics.json").write_text(json.dumps({**pinhole, "depth_scale": 1000}))
     metres = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
-    degrees = rotation_angle_deg(poses[:-1, :3, :3], poses[1:, :3, :3])
+    degrees = np.degrees(rotation_angle(poses[:-1, :3, :3], poses[1:, :3, :3]))
     print(
         f"wrote {len(timestamps)} frames to {config.out}; from one to the next "
         f"{100 * np.median(metres):.1f} cm and {np.median(degrees):.1f} deg (medians)"

@@ -45,10 +45,6 @@ SILENT = {f"{room}.{name}" for room, names in {
         "read_stamps read_trajectory read_tum run_folder save versions write_camera write_colmap "
         "write_euroc write_kitti write_ply write_tum"
     ),
-    "geometry": (
-        "angle_of_view nearest_rotation pixel_grid project_numpy resized rotation_angle_deg scale "
-        "unproject_numpy"
-    ),
     "imu": (
         "accelerometer_residual add_noise backward difference filter_imu forward gravity_note "
         "gyro_loose_residual gyro_tight_residual imu_residuals integrate_gyro interpolant propagate "

@@ -8,7 +8,7 @@ import pytest
 import jaxpose
 
 LAYERS = (
-    "errors geometry files nn nn_columns losses fields scenes render imu events evaluation datasets"
+    "errors _checks geometry files nn nn_columns losses fields scenes render imu events evaluation datasets"
     " training slam plots experiments cli __main__"
 ).split()
 PACKAGE = Path(jaxpose.__file__).parent

@@ -82,7 +82,7 @@ def test_noisy_poses_are_found_again():
         found = np.asarray(jax.vmap(field.pose, (None, 0))(state.pose, T), np.float64)
         before = np.linalg.norm(start[:, :3, 3] - ground_truth[:, :3, 3], axis=-1).mean()
         after = np.linalg.norm(found[:, :3, 3] - ground_truth[:, :3, 3], axis=-1).mean()
-        angles = rigid.rotation_angle_deg(found[:, :3, :3], ground_truth[:, :3, :3])
+        angles = np.degrees(rigid.rotation_angle(found[:, :3, :3], ground_truth[:, :3, :3]))
         assert before > 0.09 and after < 0.5 * before and angles.mean() < 1.2, (side, before, after, angles)
         assert losses[-30:].mean() < 0.2 * losses[:30].mean()
         assert int(state.step) == 400

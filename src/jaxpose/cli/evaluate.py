@@ -109,7 +109,7 @@ def run(config: Config) -> Result:
     pairs = _pair(config, estimate, reference)
     ate = trajectory_error.ate(pairs.estimate, pairs.reference, config.align)
     aligned = trajectory_error.align(ate.alignment, pairs.estimate)
-    turned = rigid.rotation_angle_deg(aligned[:, :3, :3], pairs.reference[:, :3, :3])
+    turned = np.degrees(rigid.rotation_angle(aligned[:, :3, :3], pairs.reference[:, :3, :3]))
     rpe, notes = _relative(config, pairs)
     if config.plot is not None:
         from jaxpose.plots.evaluation import comparison

@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxpose.errors import DataError
-from jaxpose.geometry.rigid import Similarity, nearest_rotation, rotation_angle_deg
+from jaxpose.geometry import rigid
+from jaxpose.geometry.rigid import Similarity, nearest_rotation, rotation_angle
 
 Alignment = Literal["none", "se3", "sim3"]
 
@@ -163,12 +164,12 @@ def rpe(
         raise DataError(
             f"relative pose error: expected two finite poses {delta:g} {apart}, got {len(estimate)} poses"
         )
-    moved, ground_truth = (_relative(T[first[used]], T[last[used]]) for T in (estimate, reference))
+    moved, ground_truth = (rigid.inverse(T[first[used]]) @ T[last[used]] for T in (estimate, reference))
     moved[:, :3, 3] *= scale
     translation, rotation = np.full((2, len(used)), np.nan)
     # The error's translation is this difference turned into the reference's last frame: of the same length.
     translation[used] = np.linalg.norm(moved[:, :3, 3] - ground_truth[:, :3, 3], axis=-1)
-    rotation[used] = rotation_angle_deg(moved[:, :3, :3], ground_truth[:, :3, :3])
+    rotation[used] = np.degrees(rotation_angle(moved[:, :3, :3], ground_truth[:, :3, :3]))
     pairs = int(used.sum())
     return Rpe(statistics(translation), statistics(rotation), translation, rotation, pairs, len(used) - pairs)
 
@@ -208,7 +209,7 @@ def procrustes(estimate: Float[np.ndarray, "n 4 4"], reference: Float[np.ndarray
 def pose_errors(estimate: Float[np.ndarray, "n 4 4"], reference: Float[np.ndarray, "n 4 4"]) -> PoseErrors:
     """Errors of camera-to-world poses after `procrustes`, as BARF (ICCV 2021) evaluates; DataError likewise.
 
-    Angles come from `rotation_angle_deg`; BARF's own formula cannot tell angles below 0.026 degrees from it.
+    Angles come from `rigid.rotation_angle`; BARF's own formula cannot tell angles below 0.026 degrees from 0.
     A world-to-camera vector turns with the camera, so `translation` also holds a share of the rotation error
     that grows with the distance to the origin; `centre` does not.
     """
@@ -216,8 +217,8 @@ def pose_errors(estimate: Float[np.ndarray, "n 4 4"], reference: Float[np.ndarra
     used = _usable(estimate, reference)
     aligned, ground_truth = align(alignment, estimate[used]), np.asarray(reference[used], np.float64)
     rotation, translation, centre = np.full((3, len(used)), np.nan)
-    rotation[used] = rotation_angle_deg(aligned[:, :3, :3], ground_truth[:, :3, :3])
-    vectors = [np.einsum("nji,nj->ni", T[:, :3, :3], T[:, :3, 3]) for T in (aligned, ground_truth)]
+    rotation[used] = np.degrees(rotation_angle(aligned[:, :3, :3], ground_truth[:, :3, :3]))
+    vectors = [rigid.inverse(T)[:, :3, 3] for T in (aligned, ground_truth)]
     translation[used] = np.linalg.norm(vectors[0] - vectors[1], axis=-1)
     centre[used] = np.linalg.norm(aligned[:, :3, 3] - ground_truth[:, :3, 3], axis=-1)
     means = [float(np.mean(values[used])) for values in (rotation, translation, centre)]
@@ -279,14 +280,3 @@ def _pairs(
     partner = np.where(off[0] <= off[1], before, after)
     close = (np.minimum(*off) <= tolerance) & (partner > np.arange(len(along)))
     return np.flatnonzero(close), partner[close]
-
-
-def _relative(
-    T_world_a: Float[np.ndarray, "n 4 4"], T_world_b: Float[np.ndarray, "n 4 4"]
-) -> Float[np.ndarray, "n 4 4"]:
-    """T_a_b of rigid poses."""
-    R_a_world = np.asarray(T_world_a, np.float64)[:, :3, :3].swapaxes(-1, -2)
-    T_a_b = np.tile(np.eye(4), (len(T_world_a), 1, 1))
-    T_a_b[:, :3, :3] = R_a_world @ T_world_b[:, :3, :3]
-    T_a_b[:, :3, 3] = np.einsum("nij,nj->ni", R_a_world, T_world_b[:, :3, 3] - T_world_a[:, :3, 3])
-    return T_a_b

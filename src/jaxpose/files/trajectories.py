@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from jaxpose.errors import DataError
 from jaxpose.files.atomic import write_text
 from jaxpose.files.tables import format_rows, read_numbers
-from jaxpose.geometry.rigid import nearest_rotation
+from jaxpose.geometry import rigid
 
 _TUM_COLUMNS = "8 numbers (t tx ty tz qx qy qz qw)"
 _KITTI_COLUMNS = "12 numbers (the rows of a 3x4 pose)"
@@ -61,8 +61,8 @@ def read_kitti(path: Path | str, *, rate_hz: float = 10.0) -> Trajectory:
     """
     path = Path(path)
     lines, values = read_numbers(path, _KITTI_COLUMNS, counts=(12,))
-    T = np.tile(np.eye(4), (len(values), 1, 1))
-    T[:, :3] = values.reshape(-1, 3, 4)
+    rows = values.reshape(-1, 3, 4)
+    T = rigid.make(rows[..., :3], rows[..., 3])
     return Trajectory(np.arange(len(T)) / rate_hz, orthonormal(T, lambda i: f"{path}:{lines[i]}"))
 
 
@@ -108,15 +108,13 @@ def orthonormal(T: Float[np.ndarray, "n 4 4"], where: Callable[[int], str]) -> F
 
     DataError with `where(i)` for the worst, pose i, if it is more than rounding off a rotation.
     """
-    rotation = nearest_rotation(T[:, :3, :3])
+    rotation = rigid.nearest_rotation(T[:, :3, :3])
     off = np.abs(T[:, :3, :3] - rotation).max(axis=(1, 2))
     if off.max() > _MOST_OFF_ROTATION:
         raise DataError(
             f"{where(int(off.argmax()))}: expected a rotation, got a matrix {off.max():.2g} off one"
         )
-    T = T.copy()
-    T[:, :3, :3] = rotation
-    return T
+    return rigid.make(rotation, T[:, :3, 3])
 
 
 def associate(
@@ -164,10 +162,7 @@ def _stamped(
         t, translation, quaternion_xyzw = t[kept], translation[kept], quaternion_xyzw[kept]
     for row in np.flatnonzero(np.diff(t) <= 0) + 1:
         raise DataError(f"{path}:{lines[row]}: expected a timestamp after {t[row - 1]!s} s, got {t[row]!s} s")
-    T = np.tile(np.eye(4), (len(t), 1, 1))
-    T[:, :3, :3] = Rotation.from_quat(quaternion_xyzw).as_matrix()
-    T[:, :3, 3] = translation
-    return Trajectory(t, T)
+    return Trajectory(t, rigid.make(Rotation.from_quat(quaternion_xyzw).as_matrix(), translation))
 
 
 # --- writing --------------------------------------------------------------------------------------------

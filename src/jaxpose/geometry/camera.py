@@ -110,17 +110,37 @@ def pixel_slopes(camera: Camera, direction_cam: Float[Array, "*n 3"]) -> Float[A
 
 
 def project_numpy(camera: Camera, point_cam: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 2"]:
-    """`project` in float64 numpy."""
+    """`project` in float64 numpy.
+
+    Args:
+        camera: The camera.
+        point_cam: Points (..., 3), any unit of length.
+
+    Returns:
+        Pixels (column, row) [px], (..., 2).
+    """
     return _project(np, camera, np.asarray(point_cam, np.float64))
 
 
 def unproject_numpy(camera: Camera, pixel: np.ndarray) -> Float[np.ndarray, "*n 3"]:
-    """`unproject` in float64 numpy; pixels of any number type."""
+    """`unproject` in float64 numpy.
+
+    Args:
+        camera: The camera.
+        pixel: Pixels (column, row) [px], (..., 2), of any number type.
+
+    Returns:
+        Directions (x, y, 1), (..., 3).
+    """
     return _unproject(np, camera, np.asarray(pixel, np.float64))
 
 
 def pixel_grid(camera: Camera, step: int = 1) -> np.ndarray:
     """Pixels (column, row) of the image: the middle of every block of `step` x `step`.
+
+    Args:
+        camera: Says how large the image is.
+        step: 1 for every pixel.
 
     Returns:
         Whole numbers (rows, columns, 2), float64.
@@ -133,7 +153,13 @@ def pixel_grid(camera: Camera, step: int = 1) -> np.ndarray:
 
 
 def angle_of_view(camera: Camera) -> tuple[float, float]:
-    """The horizontal and the vertical angle of view [rad] of the pinhole, its distortion left out.
+    """The angle of view of the pinhole, its distortion left out.
+
+    Args:
+        camera: The camera.
+
+    Returns:
+        The horizontal and the vertical angle [rad].
 
     >>> round(math.degrees(angle_of_view(Camera(320.0, 320.0, 319.5, 239.5, 640, 480))[0]), 6)
     90.0
@@ -145,6 +171,13 @@ def scale(camera: Camera, factor: float) -> Camera:
     """The camera of the image resized by `factor` (0.5: half as wide), its size rounded to whole pixels.
 
     Resizing keeps the image's outer edge, half a pixel outside the first centre: u' = (u + 0.5) s - 0.5.
+
+    Args:
+        camera: The camera of the image as it is.
+        factor: The new size by the old one.
+
+    Returns:
+        The camera of the resized image; the distortion stays.
 
     Raises:
         ValueError: For a factor that leaves no pixel.
@@ -159,6 +192,14 @@ def scale(camera: Camera, factor: float) -> Camera:
 
 def resized(camera: Camera, width: int, height: int) -> Camera:
     """The camera of the image resized to exactly this size, as `scale` says.
+
+    Args:
+        camera: The camera of the image as it is.
+        width: Columns [px] of the resized image.
+        height: Rows [px].
+
+    Returns:
+        The camera of the resized image; the distortion stays.
 
     Raises:
         ValueError: For a size below one pixel.

@@ -13,9 +13,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.spatial.transform import Rotation
 
 from jaxpose.errors import DataError
+from jaxpose.geometry import rigid
 from jaxpose.imu import eskf
 from jaxpose.imu.eskf import PoseNoise
 from jaxpose.imu.types import GRAVITY_WORLD, Gravity, Imu, ImuNoise
@@ -173,7 +173,7 @@ def _start(t, imu: Imu, late, row, used, t_pose, poses) -> eskf.State:
     velocity = (poses[b, :3, 3] - poses[a, :3, 3]) / (t_pose[b] - t_pose[a])
     T = np.array(poses[a], np.float64)
     T[:3, 3] -= velocity * late[first]
-    T[:3, :3] = T[:3, :3] @ Rotation.from_rotvec(-np.asarray(imu.omega_body)[first] * late[first]).as_matrix()
+    T[:3, :3] = T[:3, :3] @ rigid.so3_exp(-np.asarray(imu.omega_body)[first] * late[first])
     return eskf.State(*map(jnp.asarray, (T, velocity, np.zeros(3), np.zeros(3))))
 
 

@@ -3,6 +3,8 @@
 import numpy as np
 from jaxtyping import Float
 
+from jaxpose.geometry.rigid import vector_angle
+
 _MOST_OFF_UP_DEG, _MOST_OFF_GRAVITY = 10.0, 0.1  # of the mean specific force, before it is told
 
 
@@ -26,7 +28,7 @@ def gravity_note(
     between = np.stack([np.interp(t[usable], read_at, axis) for axis in force.T], axis=-1)
     mean = np.einsum("nij,nj->ni", T_world_sensor[usable, :3, :3], between).mean(axis=0)
     norm, gravity = np.linalg.norm(mean), np.linalg.norm(gravity_world)
-    off = np.degrees(np.arccos(np.clip(-mean @ gravity_world / max(norm * gravity, 1e-12), -1, 1)))
+    off = np.degrees(vector_angle(-mean, gravity_world))
     if off <= _MOST_OFF_UP_DEG and abs(norm / gravity - 1) <= _MOST_OFF_GRAVITY:
         return ()
     return (

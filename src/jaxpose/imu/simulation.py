@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation, RotationSpline, Slerp
 
 from jaxpose.errors import DataError
 from jaxpose.fields.derivatives import PoseFn, motion
+from jaxpose.geometry import rigid
 from jaxpose.imu.types import GRAVITY_WORLD, QUIET, Gravity, Imu, ImuNoise
 
 
@@ -93,16 +94,10 @@ def interpolant(
     position = CubicSpline(times, poses[:, :3, 3])
     orientation, omega_body = _rotation_path(times, Rotation.from_matrix(poses[:, :3, :3]), rotation)
 
-    def pose(t):
-        T_world_body = np.tile(np.eye(4), (len(t), 1, 1))
-        T_world_body[:, :3, :3] = orientation(t).as_matrix()
-        T_world_body[:, :3, 3] = position(t)
-        return T_world_body
-
     return Interpolant(
         first=float(times[0]),
         last=float(times[-1]),
-        pose=pose,
+        pose=lambda t: rigid.make(orientation(t).as_matrix(), position(t)),
         velocity_world=lambda t: position(t, 1),
         acceleration_world=lambda t: position(t, 2),
         omega_body=omega_body,

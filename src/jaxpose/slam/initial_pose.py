@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxpose.datasets.types import Recording
+from jaxpose.geometry import rigid
 from jaxpose.imu import Imu, integrate_gyro
 
 _AROUND_S = 2.0  # before and after: a hand's changes of speed average out, and a gyroscope's bias, both ways
@@ -54,15 +55,13 @@ def _upright(
     force_cam: Float[np.ndarray, "3"], gravity_world: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "4 4"]:
     """T_world_cam at the origin in which the mean force points up, x where the camera looks."""
-    T_world_cam = np.eye(4)
     up_world = -gravity_world / np.linalg.norm(gravity_world)
     up_cam = force_cam / np.linalg.norm(force_cam)
     ahead_cam = np.array([0.0, 0.0, 1.0])
     if np.linalg.norm(np.cross(up_cam, ahead_cam)) < _LEAST_LEVEL:
         ahead_cam = np.array([0.0, -1.0, 0.0])  # the image's upper edge
     ahead_world = np.array([1.0, 0.0, 0.0]) if abs(up_world[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
-    T_world_cam[:3, :3] = _axes(up_world, ahead_world) @ _axes(up_cam, ahead_cam).T
-    return T_world_cam
+    return rigid.make(_axes(up_world, ahead_world) @ _axes(up_cam, ahead_cam).T, np.zeros(3))
 
 
 def first_force(recording: Recording) -> Float[np.ndarray, "3"] | None:

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxpose.datasets.types import Frame
+from jaxpose.geometry import rigid
 from jaxpose.geometry.camera import Camera, project_numpy
 from jaxpose.slam.observation import Image, to_device
 
@@ -51,9 +52,8 @@ def overlap(
 
     A point counts that is at least `margin` pixels inside the image.
     """
-    T_cam_world = np.linalg.inv(T_world_cam)
-    points = np.einsum("kij,nj->kni", T_cam_world[:, :3, :3], points_world) + T_cam_world[:, None, :3, 3]
-    u, v = np.moveaxis(project_numpy(camera, points), -1, 0)
+    points_cam = rigid.apply(rigid.inverse(T_world_cam)[:, None], points_world)
+    u, v = np.moveaxis(project_numpy(camera, points_cam), -1, 0)
     inside = (u >= margin) & (u < camera.width - margin) & (v >= margin) & (v < camera.height - margin)
     return np.mean(inside, axis=1)
 

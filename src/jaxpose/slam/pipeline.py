@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 from jaxpose.datasets.types import Frame, Recording
 from jaxpose.errors import DataError
 from jaxpose.fields import Params, PoseField, bspline, control_points_along, fit
+from jaxpose.geometry import rigid
 from jaxpose.geometry.camera import Camera, angle_of_view
 from jaxpose.imu import GRAVITY_WORLD, Gravity, Imu
 from jaxpose.scenes import GridConfig, SceneField
@@ -265,7 +266,7 @@ def _first_pose(state: SlamState) -> SlamState:
     if T_world_cam is None:
         T_world_cam = upright_pose(state.imu, state.frames.t[0], state.T_body_cam, state.gravity_world)
     return state._replace(
-        frames=state.frames.put(0, T_world_body=T_world_cam @ np.linalg.inv(state.T_body_cam))
+        frames=state.frames.put(0, T_world_body=T_world_cam @ rigid.inverse(state.T_body_cam))
     )
 
 
@@ -285,7 +286,7 @@ def _update_intrinsic_frame(state: SlamState) -> SlamState:
     """The state with the intrinsic frame brought to the motions so far (Ma et al. 2024, section 3.3)."""
     frames = state.frames
     chosen, poses = window(frames.count - 1), frames.T_world_body
-    motions = np.linalg.inv(poses[chosen - 1]) @ poses[chosen]
+    motions = rigid.inverse(poses[chosen - 1]) @ poses[chosen]
     times = (frames.t[chosen] - frames.t[0]) / state.duration_s
     refit = _refit(state.camera, state.config)
     params, T_inner = refit(state.params, jnp.asarray(times, jnp.float32), jnp.asarray(motions, jnp.float32))
@@ -380,7 +381,7 @@ def _checked(state: SlamState, rgb: np.ndarray, depth: np.ndarray, t: float) -> 
 def _rigid(name: str, T: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
     T = np.asarray(T, np.float64)
     good = T.shape == (4, 4) and np.isfinite(T).all() and np.allclose(T[3], [0, 0, 0, 1])
-    if not good or np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > 1e-3 or np.linalg.det(T[:3, :3]) < 0:
+    if not good or not rigid.is_rotation(T[:3, :3], tolerance=1e-3):
         raise ValueError(f"slam.init: expected {name} to be a rigid transform (4, 4), got {T.tolist()}")
     return T
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, PRNGKeyArray
 
 from jaxpose.datasets.types import Frame
-from jaxpose.geometry.rigid import nearest_rotation, rotation_angle_deg
+from jaxpose.geometry import rigid
 from jaxpose.slam.config import RecoveryConfig
 from jaxpose.slam.keyframes import thumbnail
 from jaxpose.slam.map.backend import map_backend, scene_params
@@ -18,9 +18,7 @@ from jaxpose.slam.tracking.predict import (
     PreintegratedImu,
     TrackingProblem,
     end_velocity,
-    exp,
     imu_sigmas,
-    log,
     observe_acceleration,
     observe_gyro_bias,
     predict,
@@ -102,9 +100,9 @@ def _predict(state: SlamState) -> MotionPrediction:
 
 def _constant_velocity(predicted: MotionPrediction, found: Float[np.ndarray, "4 4"]) -> MotionPrediction:
     """The prediction at one speed to a motion that a search has found."""
-    twist = log(found)
+    twist = rigid.log(found)
     share = np.arange(1, len(predicted.timestamps) + 1) / len(predicted.timestamps)
-    T_ref_body = exp(share[:, None] * twist)
+    T_ref_body = rigid.exp(share[:, None] * twist)
     sigma = np.minimum(predicted.sigma, FOUND_SIGMA)
     return predicted._replace(timestamps=predicted.dt * share, T_ref_body=T_ref_body, sigma=sigma)
 
@@ -122,7 +120,7 @@ def _update_state(
     T_ref_body = predicted if registered is None else np.asarray(registered.T_ref_body, np.float64)
     T_world_ref = frames.T_world_body[i - 1]
     T_world_body = T_world_ref @ T_ref_body
-    T_world_body[:3, :3] = nearest_rotation(T_world_body[:3, :3])  # float32 adds up
+    T_world_body[:3, :3] = rigid.nearest_rotation(T_world_body[:3, :3])  # float32 adds up
     values = {"T_world_body": T_world_body, "status": status}
     if tracked is not None:
         names = ("iterations", "loss", "depth_error", "colour_error", "valid", "sigma")
@@ -132,7 +130,7 @@ def _update_state(
     velocity_body = end_velocity(dt, T_ref_body, prediction.readings, speed=config.uses_accelerometer)
     motion = _observe_biases(state, T_ref_body, predicted, dt) if sure else state.motion
     motion = motion._replace(
-        twist=fade * log(T_ref_body) / dt,
+        twist=fade * rigid.log(T_ref_body) / dt,
         velocity_body=velocity_body if config.uses_accelerometer else fade * velocity_body,
     )
     state = state._replace(frames=frames.put(i, **values), motion=motion)
@@ -191,9 +189,9 @@ def _relocalise(
     centres = [T_world_predicted]
     if last < i - 1:
         keyframes = np.flatnonzero(frames.keyframe)
-        away = np.linalg.inv(T_world_predicted) @ frames.T_world_body[[*keyframes, last]]
-        angle = rotation_angle_deg(away[:, :3, :3], np.tile(np.eye(3), (len(away), 1, 1)))
-        off = np.stack([np.linalg.norm(away[:, :3, 3], axis=1), np.deg2rad(angle)], axis=1)
+        away = rigid.inverse(T_world_predicted) @ frames.T_world_body[[*keyframes, last]]
+        angle = rigid.rotation_angle(away[:, :3, :3], np.eye(3))
+        off = np.stack([np.linalg.norm(away[:, :3, 3], axis=1), angle], axis=1)
         near = np.all(off <= 3 * reach, axis=1)
         unlike = np.mean((state.thumbnails - thumbnail(frame)) ** 2, axis=(1, 2, 3))
         alike = [k for k in np.argsort(unlike) if near[k]]
@@ -209,9 +207,9 @@ def _relocalise(
         image,
         jax.random.fold_in(key, 1),
     )
-    T_world_body = np.asarray(found, np.float64) @ np.linalg.inv(T_body_cam)
-    frames = _distribute_correction(frames, last, np.linalg.inv(T_world_predicted) @ T_world_body)
-    return frames, np.linalg.inv(frames.T_world_body[i - 1]) @ T_world_body
+    T_world_body = np.asarray(found, np.float64) @ rigid.inverse(T_body_cam)
+    frames = _distribute_correction(frames, last, rigid.inverse(T_world_predicted) @ T_world_body)
+    return frames, rigid.inverse(frames.T_world_body[i - 1]) @ T_world_body
 
 
 def _distribute_correction(frames: Frames, last: int, T_predicted_found: np.ndarray) -> Frames:
@@ -219,7 +217,7 @@ def _distribute_correction(frames: Frames, last: int, T_predicted_found: np.ndar
     i, t = frames.count - 1, frames.t
     lost = np.arange(last + 1, i)
     share = (t[lost] - t[last]) / (t[i] - t[last])
-    correction = exp(share[:, None] * log(T_predicted_found))
+    correction = rigid.exp(share[:, None] * rigid.log(T_predicted_found))
     return frames.put(lost, T_world_body=frames.T_world_body[lost] @ correction)
 
 
@@ -252,7 +250,7 @@ def _problem(
     """What the tracking step starts from."""
     config, t, T_world_body, last = state.config, frames.t, frames.T_world_body, frames.count - 2
     behind = [max(last - k, 0) for k in range(BEHIND + 1)]  # the last frame itself, and those before
-    past = np.linalg.inv(T_world_body[last]) @ T_world_body[behind]
+    past = rigid.inverse(T_world_body[last]) @ T_world_body[behind]
     where = reference_frame(
         config.frame,
         since_first_s=t[last] - t[0],

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from jaxpose.cli.check.findings import Checked, Fact, Finding
 from jaxpose.cli.check.poses import Order, reorder
+from jaxpose.geometry import rigid
 from jaxpose.imu import Imu
 
 _WINDOW_S = 0.05  # over which rates are compared
@@ -43,7 +44,7 @@ def check_imu(
     """Readings against poses on the same clock, both as the files state them; z is taken to point up."""
     rates = {
         "poses as read": T_world_body,
-        "world-to-body poses (inverted)": np.linalg.inv(T_world_body),
+        "world-to-body poses (inverted)": rigid.inverse(T_world_body),
         f"quaternions in the order {'xyzw' if read_as == 'wxyz' else 'wxyz'}": reorder(T_world_body, read_as),
     }
     matches = {name: match for name, T in rates.items() if (match := _match(imu, t, T))}
@@ -137,7 +138,7 @@ def _gravity(imu: Imu, t: Float[np.ndarray, " n"], T_world_imu: Float[np.ndarray
     R = Slerp(t, Rotation.from_matrix(T_world_imu[:, :3, :3]))(at[inside]).as_matrix()
     force = np.asarray(imu.acceleration_body)[inside]
     up = np.einsum("nij,nj->i", R, force) / len(R)  # the acceleration is nothing on average
-    off = np.degrees(np.arccos(np.clip(up[2] / np.linalg.norm(up), -1, 1)))
+    off = np.degrees(rigid.vector_angle(up, np.array([0.0, 0.0, 1.0])))
     test, expected = "gravity", "a specific force that points up, along z of the world"
     told = f"{np.round(up, 2).tolist()} m/s^2 on average in the world"
     if off > 180 - _OFF_DEG:
@@ -195,10 +196,8 @@ def _match(imu: Imu, t: Float[np.ndarray, " n"], T: Float[np.ndarray, "n 4 4"]) 
 
 
 def _angle_deg(R: Float[np.ndarray, "3 3"]) -> float:
-    return float(np.degrees(Rotation.from_matrix(R).magnitude()))
+    return float(np.degrees(rigid.rotation_angle(np.eye(3), R)))
 
 
 def _turned(R: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4 4"]:
-    T = np.eye(4)
-    T[:3, :3] = R
-    return T
+    return rigid.make(R, np.zeros(3))

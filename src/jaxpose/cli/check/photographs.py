@@ -14,6 +14,7 @@ from jaxpose.datasets.photos import blender, llff
 from jaxpose.datasets.photos.common import OPENGL
 from jaxpose.datasets.types import Photographs
 from jaxpose.errors import DataError
+from jaxpose.geometry import rigid
 
 _WIDTH = 8  # pixels: the images are decoded to see that they can be, and not kept
 _PARALLEL = 1e-2  # least share of the directions across the axes; less has no point in common
@@ -55,7 +56,7 @@ def _look(T: Float[np.ndarray, "n 4 4"]) -> Checked:
     front, apart = _common_point(T)
     if apart > _MEET:
         # The loader turned the axes of what it took for camera-to-world: first back to the file's.
-        turned_front, turned_apart = _common_point(np.linalg.inv(T @ OPENGL) @ OPENGL)
+        turned_front, turned_apart = _common_point(rigid.inverse(T @ OPENGL) @ OPENGL)
         if turned_apart < _MEET and turned_apart < apart / 3:
             axes = "" if turned_front > 0.5 else ", in OpenCV axes"
             found = f"optical axes that do not meet, but do with world-to-camera poses{axes}"

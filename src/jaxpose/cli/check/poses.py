@@ -7,6 +7,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from jaxpose.cli.check.findings import Checked, Fact, Finding
+from jaxpose.geometry import rigid
 
 Order = Literal["xyzw", "wxyz"]
 _JUMP = 10.0  # times what 95% of the steps stay below
@@ -105,7 +106,7 @@ def _other_order(T: Float[np.ndarray, "n 4 4"], written: Quaternions, other: Ord
             f"column {4 - own} of 4 is never negative, though signs flip {flips} times, as writers make w"
         )
     some = T[:: max(1, len(T) // _MOST)]
-    turn = Rotation.from_matrix(some[0, :3, :3].T @ some[:, :3, :3]).magnitude()
+    turn = rigid.rotation_angle(some[0, :3, :3], some[:, :3, :3])
     if turn.max() > _LEAST_TURN and np.ptp(T[:, :3, 3], axis=0).any():
         given, meant = _explained(some), _explained(reorder(some, written.order))
         if meant > given + _MORE_EXPLAINED:

@@ -9,6 +9,7 @@ from jaxpose.cli.check.poses import reorder
 from jaxpose.cli.check.views import Views, agreement, look
 from jaxpose.datasets.photos.common import OPENGL
 from jaxpose.datasets.types import Recording
+from jaxpose.geometry import rigid
 from jaxpose.imu.simulation import interpolant
 
 # x forward, y left, z up: the axes of robots' bodies, from those of OpenCV.
@@ -19,8 +20,8 @@ _CONVENTIONS = {
     "camera-to-world poses, OpenGL axes": lambda T: T @ OPENGL,
     "camera-to-world poses, axes forward, left, up": lambda T: T @ _ROBOT,
     "world-to-camera poses, OpenCV axes": np.linalg.inv,
-    "world-to-camera poses, OpenGL axes": lambda T: np.linalg.inv(T) @ OPENGL,
-    "world-to-camera poses, axes forward, left, up": lambda T: np.linalg.inv(T) @ _ROBOT,
+    "world-to-camera poses, OpenGL axes": lambda T: rigid.inverse(T) @ OPENGL,
+    "world-to-camera poses, axes forward, left, up": lambda T: rigid.inverse(T) @ _ROBOT,
     "quaternions in the order wxyz, read as xyzw": partial(reorder, read_as="xyzw"),
     "quaternions in the order xyzw, read as wxyz": partial(reorder, read_as="wxyz"),
 }
@@ -94,7 +95,7 @@ def _scores(views: Views, T_given: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     for c, convention in enumerate(_CONVENTIONS.values()):
         T = dict(zip(used, convention(T_given[used]), strict=True))
         for p, (i, j) in enumerate(views.pairs):
-            T_j_i = np.tile(np.linalg.inv(T[j]) @ T[i], (len(_SCALES), 1, 1))
+            T_j_i = np.tile(rigid.inverse(T[j]) @ T[i], (len(_SCALES), 1, 1))
             of_all[p, c], in_view[p, c] = agreement(views, p, T_j_i, _SCALES, _TOLERANCE)
     return of_all, in_view
 
@@ -109,7 +110,7 @@ def _clock(recording: Recording, views: Views) -> list[Finding]:
     ones = np.ones(len(_OFFSETS_S))
     shares = np.stack(
         [
-            agreement(views, p, np.linalg.inv(at(j)) @ at(i), ones, _FINE)[0]
+            agreement(views, p, rigid.inverse(at(j)) @ at(i), ones, _FINE)[0]
             for p, (i, j) in enumerate(views.pairs)
         ]
     )

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxpose.datasets.types import Recording
 from jaxpose.geometry.camera import pixel_grid, project_numpy, unproject_numpy
-from jaxpose.geometry.rigid import rotation_angle_deg
+from jaxpose.geometry.rigid import rotation_angle
 
 _ANCHORS = 8
 _MOST_TURN_DEG = 20.0  # between two frames, so that they see the same
@@ -79,7 +79,7 @@ def _pairs(T: Float[np.ndarray, "n 4 4"]) -> list[tuple[int, int]]:
     pairs = set()
     for k in np.linspace(0, 0.9 * (len(usable) - 1), _ANCHORS).astype(int):
         later = usable[k + 1 :]
-        turn = rotation_angle_deg(np.repeat(T[usable[k], None, :3, :3], len(later), 0), T[later, :3, :3])
+        turn = np.degrees(rotation_angle(T[usable[k], :3, :3], T[later, :3, :3]))
         far = int((turn > _MOST_TURN_DEG).argmax()) if (turn > _MOST_TURN_DEG).any() else len(later)
         pairs |= {(int(usable[k]), int(later[max(1, far // part) - 1])) for part in (1, 2, 4)}
     return sorted(pairs)

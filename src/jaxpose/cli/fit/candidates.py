@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import median_filter
-from scipy.spatial.transform import Rotation
 
 from jaxpose import fields
 from jaxpose.cli.fit.types import FEWEST, Fitted, Inertial, Sensor
@@ -118,7 +117,7 @@ def fit_field(
     poses = jax.jit(jax.vmap(field.pose, (None, 0)))  # parameters as constants would be worked on for seconds
     T = np.asarray(poses(params, jnp.asarray(local.t[held], jnp.float32)), np.float64)
     distance = around.scale * np.linalg.norm(T[:, :3, 3] - local.T[held, :3, 3], axis=1)
-    angle = rigid.rotation_angle_deg(T[:, :3, :3], local.T[held, :3, :3])
+    angle = np.degrees(rigid.rotation_angle(T[:, :3, :3], local.T[held, :3, :3]))
     span = (around.t0, around.t0 + float(local.t[-1]))
     fitted = Fitted(
         candidate.name,
@@ -162,8 +161,7 @@ def bandwidth_hz(trajectory: Trajectory) -> float:
     """
     t = trajectory.t
     step = float(np.median(np.diff(t)))
-    relative = np.linalg.inv(trajectory.T[:-1]) @ trajectory.T[1:]
-    turn = Rotation.from_matrix(relative[:, :3, :3]).as_rotvec()
+    turn = rigid.so3_log((rigid.inverse(trajectory.T[:-1]) @ trajectory.T[1:])[:, :3, :3])
     speeds = np.concatenate([np.diff(trajectory.T[:, :3, 3], axis=0), turn], axis=1) / np.diff(t)[:, None]
     speeds = median_filter(speeds, (5, 1))
     middle = (t[1:] + t[:-1]) / 2

@@ -16,6 +16,7 @@ from jaxpose.datasets.photos.common import check_poses, frame_numbers, read_imag
 from jaxpose.datasets.types import EventRecording, Photographs
 from jaxpose.errors import DataError
 from jaxpose.events import Events, Mosaic
+from jaxpose.geometry import rigid
 from jaxpose.geometry.camera import Camera
 
 _LAYOUT = "intrinsics/*.txt, pose/*.txt and events/*.npz, or a folder train of them"
@@ -189,8 +190,7 @@ def _closes(T_world_cam: Float[np.ndarray, "n 4 4"]) -> bool:
         return False
     after = np.roll(T_world_cam, -1, axis=0)
     step = np.linalg.norm(after[:, :3, 3] - T_world_cam[:, :3, 3], axis=1)
-    trace = np.einsum("nij,nij->n", after[:, :3, :3], T_world_cam[:, :3, :3])
-    angle = np.arccos(np.clip((trace - 1) / 2, -1, 1))
+    angle = rigid.rotation_angle(T_world_cam[:, :3, :3], after[:, :3, :3])
     moved = bool(np.median(step[:-1]) > 0)
     return moved and all(x[-1] <= _CLOSED * np.median(x[:-1]) + 1e-6 for x in (step, angle))
 

@@ -12,6 +12,7 @@ from jaxpose.datasets.images import SUFFIXES, image_size, natural_order
 from jaxpose.datasets.photos.common import OPENGL, check_poses, extent_depths, frame_numbers, read_images
 from jaxpose.datasets.types import Photographs, take
 from jaxpose.errors import DataError
+from jaxpose.geometry import rigid
 from jaxpose.geometry.camera import Camera
 
 _LENS = ("k1", "k2", "p1", "p2", "k3")
@@ -152,7 +153,7 @@ def _times(file: Path, frames: list[dict[str, Any]]) -> tuple[Float[np.ndarray, 
 
 def _poses(file: Path, frames: list[dict[str, Any]]) -> Float[np.ndarray, "n 4 4"]:
     """Camera-to-world in OpenCV axes; the world's stay as they are."""
-    T_world_cam = np.tile(np.eye(4), (len(frames), 1, 1))
+    rows = np.empty((len(frames), 3, 4))
     for number, frame in enumerate(frames):
         try:
             matrix = np.array(frame.get("transform_matrix"), np.float64)
@@ -163,7 +164,8 @@ def _poses(file: Path, frames: list[dict[str, Any]]) -> Float[np.ndarray, "n 4 4
                 f"{file}: {frame['file_path']}: expected a transform_matrix of 4 rows of 4 numbers, "
                 f"got {str(frame.get('transform_matrix'))[:60]}"
             )
-        T_world_cam[number, :3] = matrix[:3]
+        rows[number] = matrix[:3]
+    T_world_cam = rigid.make(rows[..., :3], rows[..., 3])
     return check_poses(T_world_cam, lambda i: f"{file}: {frames[i]['file_path']}") @ OPENGL
 
 

@@ -9,8 +9,8 @@ from jaxpose.datasets.images import SUFFIXES, image_size
 from jaxpose.datasets.photos.common import OPENGL, check_poses, frame_numbers, read_images
 from jaxpose.datasets.types import Photographs, take
 from jaxpose.errors import DataError
+from jaxpose.geometry import rigid
 from jaxpose.geometry.camera import Camera
-from jaxpose.geometry.rigid import nearest_rotation
 
 _NEAREST = 0.75  # share of the least depth bound that becomes 1
 _FARTHEST = 1e8  # [scene units] where BARF's disparity of 1e-8 is
@@ -133,14 +133,11 @@ def _poses(
     """Camera-to-world in the mean camera's axes (OpenCV), and the scene's depths, both scaled."""
     columns = rows[:, :15].reshape(-1, 3, 5)
     scale = 1 / (_NEAREST * rows[:, 15].min())
-    T = np.tile(np.eye(4), (len(rows), 1, 1))
-    down, right, back = (columns[:, :, k] for k in range(3))
-    T[:, :3, :3] = np.stack([right, -down, back], axis=-1)
-    T[:, :3, 3] = scale * columns[:, :, 3]
+    down, right, back, position = (columns[:, :, k] for k in range(4))
+    T = rigid.make(np.stack([right, -down, back], axis=-1), scale * position)
     T = check_poses(T, lambda i: f"{file}: row {i}")
     up, back = (axis / np.linalg.norm(axis) for axis in T[:, :3, 1:3].mean(0).T)
-    mean = np.eye(4)
-    mean[:3, :3] = nearest_rotation(np.stack([np.cross(up, back), up, back], axis=-1))
-    mean[:3, 3] = T[:, :3, 3].mean(0)
+    turn = rigid.nearest_rotation(np.stack([np.cross(up, back), up, back], axis=-1))
+    mean = rigid.make(turn, T[:, :3, 3].mean(0))
     bounds = (float(scale * rows[:, 15].min()), float(scale * rows[:, 16].max()))
-    return OPENGL @ np.linalg.inv(mean) @ T @ OPENGL, bounds
+    return OPENGL @ rigid.inverse(mean) @ T @ OPENGL, bounds

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.ndimage import distance_transform_edt, minimum_filter
 
-from jaxpose.geometry import se3
+from jaxpose.geometry import rigid, se3
 from jaxpose.geometry.camera import Camera, project
 
 _WINDOW = 9  # [px] wide: within it the nearest point hides those behind it
@@ -35,7 +35,7 @@ def depth_from_cloud(
         return project(camera, jnp.where(z[:, None] > _NEAREST, point_cam, -1)), z
 
     def depth(T_world_cam: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "h w"]:
-        pixel, z = (np.asarray(x) for x in look(jnp.asarray(np.linalg.inv(T_world_cam), jnp.float32)))
+        pixel, z = (np.asarray(x) for x in look(jnp.asarray(rigid.inverse(T_world_cam), jnp.float32)))
         column, row = np.rint(pixel).astype(np.int64).T
         inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
         column, row, z = column[inside], row[inside], z[inside]

@@ -36,6 +36,7 @@ from jaxpose.datasets.types import Frame, Recording
 from jaxpose.errors import DataError
 from jaxpose.files.ply import read_points
 from jaxpose.files.trajectories import Trajectory
+from jaxpose.geometry import rigid
 from jaxpose.geometry.camera import Camera
 from jaxpose.imu import Imu, ImuNoise
 
@@ -121,7 +122,7 @@ def load(path: Path | str) -> Recording:
         read=lambda i: Frame(read_color(cam0.files[rows[i]]), depth.read(rows[i])),
         T_world_cam=poses,
         imu=log.imu._replace(t=np.asarray(log.imu.t) - t[rows[0]]),
-        T_body_cam=np.linalg.inv(log.T_body_imu) @ cam0.T_body_cam,
+        T_body_cam=rigid.inverse(log.T_body_imu) @ cam0.T_body_cam,
         notes=(*depth.notes, *lacking, *_unused(mav0)),
         t0=cam0.stamps_ns[rows[0]] * 1e-9,
         files=within([cam0.files[row] for row in rows], path),
@@ -163,9 +164,7 @@ def load_truth(path: Path | str) -> GroundTruth:
     if abs(norm - 1).max() > 1e-2:
         row = int(abs(norm - 1).argmax())
         raise DataError(f"{file}:{lines[row]}: expected a unit quaternion, got norm {norm[row]:.4g}")
-    T_world_body = np.tile(np.eye(4), (len(timestamps), 1, 1))
-    T_world_body[:, :3, :3] = Rotation.from_quat(values[:, [4, 5, 6, 3]]).as_matrix()
-    T_world_body[:, :3, 3] = values[:, :3]
+    T_world_body = rigid.make(Rotation.from_quat(values[:, [4, 5, 6, 3]]).as_matrix(), values[:, :3])
     return GroundTruth(
         seconds(timestamps, t0_ns), T_world_body, values[:, 7:10], values[:, 10:13], values[:, 13:16]
     )

@@ -10,6 +10,7 @@ from jaxpose.datasets.types import Recording
 from jaxpose.errors import DataError
 from jaxpose.files.tables import read_numbers
 from jaxpose.files.trajectories import orthonormal
+from jaxpose.geometry import rigid
 from jaxpose.imu import Imu
 from jaxpose.imu.gravity import gravity_note
 
@@ -95,7 +96,7 @@ def imu_notes(recording: Recording, name: Path | str) -> tuple[str, ...]:
     if not inside.all():
         notes.append(f"the IMU covers {inside.sum()} of {len(t)} frames: {spans[1]} of {spans[0]}")
     if recording.T_world_cam is not None:
-        T_world_body = recording.T_world_cam @ np.linalg.inv(recording.T_body_cam)
+        T_world_body = recording.T_world_cam @ rigid.inverse(recording.T_body_cam)
         force = np.asarray(recording.imu.acceleration_body)
         notes += gravity_note(at, force, t, T_world_body, recording.gravity_world, "the IMU")
     return tuple(notes)

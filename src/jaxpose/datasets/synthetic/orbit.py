@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxpose.datasets.types import Photographs
+from jaxpose.geometry import rigid
 from jaxpose.geometry.camera import Camera, unproject
 
 DIAMETER = 8.0  # of the circle [scene units]; the object lies within 1.7 of its centre
@@ -75,10 +76,7 @@ def orbit_poses(t: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 4 4"]:
     forward = -centre / np.linalg.norm(centre, axis=-1, keepdims=True)
     right = np.cross(forward, [0, 0, 1.0])
     right /= np.linalg.norm(right, axis=-1, keepdims=True)
-    T_world_cam = np.tile(np.eye(4), (len(t), 1, 1))
-    T_world_cam[:, :3, :3] = np.stack([right, np.cross(forward, right), forward], axis=-1)
-    T_world_cam[:, :3, 3] = centre
-    return T_world_cam
+    return rigid.make(np.stack([right, np.cross(forward, right), forward], axis=-1), centre)
 
 
 def image(

@@ -6,10 +6,11 @@ Both give T_noise in the frame of the camera it disturbs: T_init = T_true . T_no
 import math
 
 import numpy as np
-import scipy.linalg
 from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, Slerp
+
+from jaxpose.geometry import rigid
 
 
 def correlated(
@@ -37,10 +38,7 @@ def correlated(
     # Within one radian of the identity arcs are unique and stay there, so no rotation vector jumps at pi.
     turn /= np.linalg.norm(turn, axis=1).max()
     turn = Slerp(at, Rotation.from_rotvec(turn))(np.clip(t, first, last)).as_rotvec()
-    T_noise = np.tile(np.eye(4), (len(t), 1, 1))
-    T_noise[:, :3, :3] = Rotation.from_rotvec(_scaled(turn, math.radians(rotation_deg))).as_matrix()
-    T_noise[:, :3, 3] = _scaled(shift, translation)
-    return T_noise
+    return rigid.make(rigid.so3_exp(_scaled(turn, math.radians(rotation_deg))), _scaled(shift, translation))
 
 
 def independent(n: int, sigma: float, seed: int) -> Float[np.ndarray, "n 4 4"]:
@@ -51,12 +49,7 @@ def independent(n: int, sigma: float, seed: int) -> Float[np.ndarray, "n 4 4"]:
     """
     if not 0 <= sigma < math.inf:
         raise ValueError(f"sigma: expected 0 or more, got {sigma}")
-    rho, (x, y, z) = np.random.default_rng(seed).normal(scale=sigma, size=(2, 3, n))
-    twist = np.zeros((n, 4, 4))
-    twist[:, 2, 1], twist[:, 0, 2], twist[:, 1, 0] = x, y, z
-    twist[:, 1, 2], twist[:, 2, 0], twist[:, 0, 1] = -x, -y, -z
-    twist[:, :3, 3] = rho.T
-    return scipy.linalg.expm(twist)
+    return rigid.exp(np.random.default_rng(seed).normal(scale=sigma, size=(6, n)).T)
 
 
 def _scaled(deviations: Float[np.ndarray, "n 3"], largest: float) -> Float[np.ndarray, "n 3"]:

@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from jaxpose.datasets.ground_truth import poses_at
 from jaxpose.datasets.rgbd import euroc
@@ -17,6 +16,7 @@ from jaxpose.datasets.synthetic import hand_held
 from jaxpose.datasets.synthetic.furniture import SIZE, Extent
 from jaxpose.errors import DataError
 from jaxpose.files.trajectories import Trajectory
+from jaxpose.geometry import rigid
 from jaxpose.imu import GRAVITY_WORLD, Imu, ImuNoise
 from jaxpose.imu.simulation import simulate
 
@@ -57,8 +57,8 @@ def by_hand(
         T_world_body, imu = _readings(walk, *times, jax.random.key(seed), noise, gravity_world)
         T_world_body, imu = np.asarray(T_world_body), Imu(*(np.array(x) for x in imu))
     # From right, down, forwards to forwards, left, up, not quite.
-    turn = Rotation.from_rotvec(_MOUNTING).as_matrix() @ [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
-    return Motion("room", t, T_world_body, imu, _pose(turn, _LEVER_ARM), SIZE)
+    turn = rigid.so3_exp(np.array(_MOUNTING)) @ [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
+    return Motion("room", t, T_world_body, imu, rigid.make(turn, np.array(_LEVER_ARM)), SIZE)
 
 
 @partial(jax.jit, static_argnames=("noise", "gravity_world"))
@@ -94,7 +94,7 @@ def recorded(folder: Path | str, duration_s: float, rate_hz: float) -> Motion:
     room = float(max(wide, SIZE[0])), float(max(deep, SIZE[1])), float(max(upper[2] + _ABOVE, SIZE[2]))
     name = folder.resolve().parent.name if folder.resolve().name == "mav0" else folder.resolve().name
     sheet = sensors(folder) / "cam0" / "sensor.yaml"
-    own = _pose(Rotation.from_matrix(_EUROC_CAM0).as_matrix(), _EUROC_LEVER_ARM)
+    own = rigid.make(rigid.nearest_rotation(np.array(_EUROC_CAM0)), np.array(_EUROC_LEVER_ARM))
     extent = " x ".join(f"{side:.1f}" for side in room)
     what = (
         f"motion and IMU readings are those of {name}, {t[-1]:.1f} s from {first:.2f} s on; all images are "
@@ -109,9 +109,3 @@ def recorded(folder: Path | str, duration_s: float, rate_hz: float) -> Motion:
         room,
         (what,),
     )
-
-
-def _pose(R: np.ndarray, position: tuple[float, float, float]) -> Float[np.ndarray, "4 4"]:
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = R, position
-    return pose

@@ -18,7 +18,7 @@ from jaxpose.experiments.event_nerf.setup import Setup
 from jaxpose.experiments.image_metrics import image_metrics, means, pose_numbers
 from jaxpose.experiments.training_loop import pose_reader
 from jaxpose.fields import piecewise_geodesic, set_progress
-from jaxpose.geometry.rigid import Similarity
+from jaxpose.geometry.rigid import Similarity, vector_angle
 from jaxpose.plots.nerf import HeldOut
 from jaxpose.training import photometric
 from jaxpose.training.photometric import TrainConfig
@@ -206,4 +206,4 @@ def _slide(
 
 
 def _angle_deg(a: Float[np.ndarray, "3"], b: Float[np.ndarray, "3"]) -> float:
-    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
+    return float(np.degrees(vector_angle(a, b)))

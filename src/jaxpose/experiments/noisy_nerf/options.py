@@ -15,6 +15,7 @@ from jaxpose.datasets.types import Photographs, every, take
 from jaxpose.errors import DataError
 from jaxpose.experiments.command import check_least, check_resume
 from jaxpose.experiments.training_loop import CHUNK, NetConfig
+from jaxpose.geometry import rigid
 
 Pose = Literal["posenet", "table", "bspline", "spline_reset"]
 Study = Literal["fields", "encoding", "size", "spline", "ablations"]
@@ -173,4 +174,4 @@ def _disturbed(config: Config, train: Photographs, extent: float) -> tuple[Float
     if config.side == "camera":
         return ground_truth @ T_noise, words
     # World-to-camera this is T_c,w . T_noise, as in the supplement's section 6.
-    return np.linalg.inv(T_noise) @ ground_truth, words
+    return rigid.inverse(T_noise) @ ground_truth, words

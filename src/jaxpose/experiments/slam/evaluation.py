@@ -96,9 +96,9 @@ def freedom(recording: Recording, result: SlamResult) -> Freedom | None:
     """The effective degrees of freedom before and after (paper figure 6); None but for `intrinsic`."""
     if not np.isfinite(result.frames.T_inner[1:]).all():
         return None
-    T_world_body = result.T_world_cam @ np.linalg.inv(recording.T_body_cam)
+    T_world_body = result.T_world_cam @ rigid.inverse(recording.T_body_cam)
     view = angle_of_view(recording.camera)[0]
-    motions = (np.linalg.inv(T_world_body[:-1]) @ T_world_body[1:], result.frames.T_inner[1:])
+    motions = (rigid.inverse(T_world_body[:-1]) @ T_world_body[1:], result.frames.T_inner[1:])
     before, after = (np.asarray(effective_dof(jnp.asarray(motion, jnp.float32), view)) for motion in motions)
     numbers = {"threshold": THRESHOLD, "before_mean": float(before.mean()), "after_mean": float(after.mean())}
     return Freedom(before, after, numbers)
@@ -117,7 +117,7 @@ def accuracy(
     """The usual trajectory errors of the tracked poses, and of the final field read at the frames' times."""
     ate = trajectory_error.ate(result.T_world_cam, T_world_true)
     aligned = trajectory_error.align(ate.alignment, result.T_world_cam)
-    rotation_deg = rigid.rotation_angle_deg(aligned[:, :3, :3], T_world_true[:, :3, :3])
+    rotation_deg = np.degrees(rigid.rotation_angle(aligned[:, :3, :3], T_world_true[:, :3, :3]))
     field = jax.jit(jax.vmap(result.field.pose, (None, 0)))
     field_poses = np.asarray(field(result.field_params, jnp.asarray(t, jnp.float32)), np.float64)
     numbers = {
@@ -156,7 +156,7 @@ def inertial(recording: Recording, result: SlamResult) -> Inertial | None:
         return None
     chosen = inside[:: -(-len(inside) // _MOST_READINGS)]
     t, read_omega, read_force = t[chosen], read_omega[chosen], read_force[chosen]
-    T_cam_body = jnp.asarray(np.linalg.inv(recording.T_body_cam), jnp.float32)
+    T_cam_body = jnp.asarray(rigid.inverse(recording.T_body_cam), jnp.float32)
     gravity_world = jnp.asarray(recording.gravity_world, jnp.float32)
 
     @jax.jit

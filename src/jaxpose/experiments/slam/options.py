@@ -17,6 +17,7 @@ from jaxpose.datasets.synthetic import RoomConfig, room
 from jaxpose.datasets.types import Recording, select, thin
 from jaxpose.errors import DataError
 from jaxpose.files import atomic
+from jaxpose.geometry import rigid
 from jaxpose.imu import ADIS16448, QUIET, Imu, ImuNoise
 from jaxpose.imu.eskf import PoseNoise
 from jaxpose.imu.filtering import filter_imu
@@ -205,7 +206,7 @@ def _unbiased(recording: Recording, imu: Imu, options: Options) -> Imu:
     """Readings less their biases by the error-state filter on the true poses (paper section 4.3)."""
     if recording.T_world_cam is None:
         raise DataError(f"{recording.name}: --imu-filter expected true poses, got none")
-    ground_truth = recording.T_world_cam @ np.linalg.inv(recording.T_body_cam)
+    ground_truth = recording.T_world_cam @ rigid.inverse(recording.T_body_cam)
     with jax.enable_x64(True):
         found = filter_imu(
             imu,
@@ -234,7 +235,7 @@ def _simulated(recording: Recording, options: Options) -> Imu:
         )
     return simulate_from_poses(
         recording.t,
-        ground_truth @ np.linalg.inv(recording.T_body_cam),
+        ground_truth @ rigid.inverse(recording.T_body_cam),
         SIMULATED_HZ,
         rotation=options.imu_rotation,
         noise=options.slam.imu_noise,

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxpose.datasets.types import Frame
+from jaxpose.geometry import rigid
 from jaxpose.geometry.camera import Camera, pixel_grid, unproject_numpy
 from jaxpose.scenes import GridConfig, SceneField, bounding_grid, grid, grow, merge
 from jaxpose.scenes.types import Params
@@ -121,7 +122,7 @@ def seen_points(
     depth = frame.depth[step // 2 :: step, step // 2 :: step]
     seen = depth > 0
     points = unproject_numpy(camera, pixel[seen]) * depth[seen][:, None]
-    return points @ T_world_cam[:3, :3].T + T_world_cam[:3, 3]
+    return rigid.apply(T_world_cam, points)
 
 
 def grow_to_fit(points: Float[np.ndarray, "n 3"], state: SlamState) -> SlamState:

@@ -6,10 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
-from scipy.spatial.transform import Rotation
 
 from jaxpose import imu as inertial
-from jaxpose.geometry import se3
+from jaxpose.geometry import rigid
 from jaxpose.imu import Imu, ImuNoise, ResidualSigmas
 from jaxpose.slam.tracking.reference_frames import ReferenceFrame
 
@@ -45,19 +44,6 @@ class PreintegratedImu(NamedTuple):
     acceleration_body: Float[Array, "s 3"]  # free of gravity [m/s^2]
     velocity_ref: Float[Array, "s 3"]  # acceleration integrated once, from rest [m/s]
     position_ref: Float[Array, "s 3"]  # and twice [m]
-
-
-_exp, _log = jax.jit(se3.exp), jax.jit(se3.log)  # a call at a time compiles every operation by itself
-
-
-def exp(xi: Float[np.ndarray, "*n 6"]) -> Float[np.ndarray, "*n 4 4"]:
-    """`se3.exp` of arrays on the host, float64 with the digits of float32."""
-    return np.asarray(_exp(jnp.asarray(xi, jnp.float32)), np.float64)
-
-
-def log(T: Float[np.ndarray, "*n 4 4"]) -> Float[np.ndarray, "*n 6"]:
-    """`se3.log` of arrays on the host, float64 with the digits of float32."""
-    return np.asarray(_log(jnp.asarray(T, jnp.float32)), np.float64)
 
 
 @jax.jit
@@ -136,18 +122,16 @@ def predict(
     where there are no readings, both stay as they were.
     """
     timestamps = t * np.arange(1, AHEAD + 1) / AHEAD
-    steady = exp(timestamps[:, None] * twist)
+    steady = rigid.exp(timestamps[:, None] * twist)
     count = int(np.sum(np.asarray(readings.mask)))
     if not rotation or count < 2:
         return timestamps, steady
     nearest = np.searchsorted(np.asarray(readings.imu.t)[:count], timestamps - 1e-6).clip(0, count - 1)
     timestamps = np.asarray(readings.imu.t, np.float64)[nearest]
-    poses = np.tile(np.eye(4), (AHEAD, 1, 1))
-    poses[:, :3, :3] = np.asarray(readings.R_ref_body)[nearest]
-    poses[:, :3, 3] = timestamps[:, None] * velocity_ref
+    position = timestamps[:, None] * velocity_ref
     if speed:
-        poses[:, :3, 3] += np.asarray(readings.position_ref)[nearest]
-    return timestamps, poses
+        position = position + np.asarray(readings.position_ref)[nearest]
+    return timestamps, rigid.make(np.asarray(readings.R_ref_body)[nearest], position)
 
 
 def prediction_sigma(
@@ -159,8 +143,7 @@ def prediction_sigma(
     to `gyro_bias_sigma` [rad/s], makes; with the accelerometer what a centimetre of error in the last poses
     and 0.1 m/s^2 of tilt or bias make of the speed.
     """
-    trace = np.trace(T_ref_body[:3, :3])
-    angle = float(np.arccos(np.clip((trace - 1) / 2, -1, 1)))
+    angle = float(rigid.rotation_angle(np.eye(3), T_ref_body[:3, :3]))
     distance = float(np.linalg.norm(T_ref_body[:3, 3]))
     return np.array([
         0.015 + 0.1 * t**2 if speed else 0.4 * distance + 0.01,
@@ -213,7 +196,7 @@ def observe_gyro_bias(
     What it was off by is about the bias that is left times t. Kalman's gain for turns known to
     `rotation_sigma` [rad], the bias wandering by `walk` [rad/s/sqrt(s)].
     """
-    off = Rotation.from_matrix(R_predicted_found).as_rotvec() / t
+    off = rigid.so3_log(R_predicted_found) / t
     before, noise = bias_sigma**2 + walk**2 * t, (rotation_sigma / t) ** 2
     gain = before / (before + noise)
     return bias - gain * off, float(np.sqrt((1 - gain) * before))

@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.spatial.transform import Rotation
 
 from jaxpose.fields import Params, PoseField, PoseFn, PoseNetConfig, anchored, in_frame, intrinsic, posenet
+from jaxpose.geometry import rigid
 from jaxpose.slam.config import FrameName
 
 
@@ -94,7 +94,7 @@ def reference_frame(
     """The reference at a last frame, `since_first_s` after the first; both frames by the body's poses."""
     T_ref_field = np.eye(4)
     if name == "world":
-        T_ref_field = np.linalg.inv(T_world_ref) @ T_world_first
+        T_ref_field = rigid.inverse(T_world_ref) @ T_world_first
     elif name == "random":
         T_ref_field = _perturbation(generator)
     clock, rate = (0.0, 1 / interval_s) if name == "anchored" else (since_first_s, 1 / duration_s)
@@ -103,7 +103,5 @@ def reference_frame(
 
 def _perturbation(generator: np.random.Generator) -> np.ndarray:
     """A random motion of about 0.1 rad and 0.1 m: the paper does not say how large; we do."""
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_rotvec(generator.normal(0, 0.1, 3)).as_matrix()
-    T[:3, 3] = generator.normal(0, 0.1, 3)
-    return T
+    turn, shift = generator.normal(0, 0.1, (2, 3))
+    return rigid.make(rigid.so3_exp(turn), shift)
