@@ -27,6 +27,16 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_debug_key_reuse", True)
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item):
+    """Most of what a test takes is compilation: only what is marked `optimised` is compiled as users have it.
+
+    These are the numerics that a compiler could break, and what runs longer than it compiles.
+    """
+    quickly = item.get_closest_marker("optimised") is None
+    jax.config.update("jax_disable_most_optimizations", quickly)
+
+
 @pytest.fixture(params=["float32", "float64"])
 def dtype(request):
     """Run the test in float32 and, with 64-bit types enabled, in float64."""

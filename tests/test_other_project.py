@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxpose.fields import PoseNetConfig, posenet
@@ -14,6 +15,8 @@ from jaxpose.fields.derivatives import motion
 from jaxpose.imu import gyro_tight_residual
 from jaxpose.losses import weighted_mean
 from jaxpose.render import Ray, render_ray, surface_weights
+
+pytestmark = pytest.mark.optimised
 
 TIMES = jnp.linspace(0.0, 1.0, 5)
 DEPTHS = jnp.linspace(0.5, 3.5, 41)

@@ -36,14 +36,6 @@ FILES = {
 }  # fmt: skip
 
 
-@pytest.fixture(scope="module", autouse=True)
-def compile_quickly():
-    """Most of a small run is compilation, and here nobody waits for what comes of it."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
-
-
 def smoke(**changes):
     return Config(smoke=True, settle_steps=2, **changes)
 

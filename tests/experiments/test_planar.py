@@ -33,14 +33,6 @@ NET = PoseNetConfig(layers=2, width=16)
 FILES = {"config.json", "results.json", "corner_errors.png", "motions", "motion_00.png", "motion_01.png"}
 
 
-@pytest.fixture(scope="module", autouse=True)
-def compile_quickly():
-    """Most of a small run is compilation, and here nobody waits for what comes of it."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
-
-
 def ramp(width=96, height=64):
     """A photograph whose colours are its coordinates: (x + 1) / 2, (y + 1) / 2 and a product of the two."""
     x, y = np.meshgrid(np.arange(width) + 0.5 - width / 2, np.arange(height) + 0.5 - height / 2)

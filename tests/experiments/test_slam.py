@@ -38,14 +38,6 @@ FILES = PICTURES | {
 }  # fmt: skip
 
 
-@pytest.fixture(scope="module", autouse=True)
-def compile_quickly():
-    """Most of a smoke run is compilation, and here nobody waits for what comes of it."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
-
-
 @pytest.fixture(scope="module")
 def recording() -> Recording:
     return room(RoomConfig(duration_s=(FRAMES - 1) / 5, width=80, height=60, holes=False))

@@ -19,14 +19,6 @@ TIMES = np.concatenate([np.linspace(-0.3, 5.1, 97), np.linspace(0.5, 4.0, 8), [2
 STAMPS = np.array([0.5, 0.9, 2.0, 2.1, 4.0])
 
 
-@pytest.fixture(scope="module", autouse=True)
-def compile_quickly():
-    """Most of a test here is compilation, and nobody waits for what comes of it."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
-
-
 @pytest.fixture(autouse=True)
 def double():
     """Fields are smooth functions of time; in float32 they are that only to the rounding of their time."""

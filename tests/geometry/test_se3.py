@@ -17,6 +17,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from jaxpose.geometry import se3
 
+pytestmark = pytest.mark.optimised
+
 # 0.4 and 0.403 straddle the switch of the logarithm, 0.999 and 1.001 that of the exponential
 ANGLES = [0.0, 1e-8, 1e-4, 3e-3, 0.1, 0.4, 0.403, 0.999, 1.001, 2.0, 3.1, math.pi - 1e-6, math.pi]
 # with these, each component of the quaternion is the largest one near pi
