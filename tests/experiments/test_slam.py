@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -155,38 +156,58 @@ def test_the_progress_of_a_resumed_run_begins_where_it_goes_on(capsys):
     assert "5/5" in said and "lost=2" in said and "1.0 cm" in said
 
 
-def test_compare_runs_every_mode(finished, tmp_path, monkeypatch, recording):
-    modes = []
+MODES = ["none", "loose", "tight", "accelerometer", "combined"]
 
-    def quick(used, config, on_frame, state):
-        modes.append(config.imu)
-        field, params = slam_pipeline.load_field(finished.folder)
-        poses = trajectories.read_tum(finished.folder / "trajectory.txt").T
-        return slam_pipeline.SlamResult(
-            poses, np.full_like(poses, np.nan), *np.zeros((2, FRAMES), bool), np.ones(FRAMES, bool),
-            np.ones(FRAMES, int), *np.ones((4, FRAMES)), np.ones((FRAMES, 2)), np.ones(FRAMES),
-            None, None, (np.zeros(1),) * 2,
-            np.zeros(0, int), field, params, 0.0, 0.0,
-        )  # fmt: skip
 
-    monkeypatch.setattr(slam_pipeline, "track", quick)
-    monkeypatch.setattr(slam_pipeline, "inertial", lambda *args: None)
-    monkeypatch.setattr(slam_pipeline, "_draw", lambda *args: None)
-    monkeypatch.setattr(slam_pipeline, "_write_surface", lambda *args: ())
-    monkeypatch.setattr(slam_pipeline, "write_map", lambda *args: None)
-    monkeypatch.setattr(slam_pipeline, "renderer", lambda *args: None)
-    monkeypatch.setattr(slam_pipeline, "map_quality", lambda *args: {"mapped": None, "held_out": None})
-    outcome = imu_slam.run(imu_slam.Config(smoke=True, compare=True, out=tmp_path / "all"))
-    assert modes == ["none", "loose", "tight", "accelerometer", "combined"]
-    assert {p.name for p in outcome.folder.iterdir()} == {
-        *modes, "config.json", "results.json", "table.md", "comparison.png",
+def assert_side_by_side(outcome):
+    """Every mode has its folder and its settings, and the table its rows, in order, of its own numbers."""
+    folder, results = outcome
+    assert {path.name for path in folder.iterdir()} == {
+        *MODES, "config.json", "results.json", "table.md", "comparison.png",
     }  # fmt: skip
-    for mode in modes:
-        config = json.loads((outcome.folder / mode / "config.json").read_text())
+    rows = (folder / "table.md").read_text().splitlines()[2:]
+    for mode, row in zip(MODES, rows, strict=True):
+        config = json.loads((folder / mode / "config.json").read_text())
         assert config["slam"]["imu"] == mode and config["compare"] is False
-    rows = (outcome.folder / "table.md").read_text().splitlines()
-    assert len(rows) == 2 + len(modes)
-    assert table(outcome.results["modes"]) in report(*outcome)
+        assert results["modes"][mode] == json.loads((folder / mode / "results.json").read_text())
+        cells = [cell.strip() for cell in row.strip("|").split("|")]
+        assert cells[0] == mode and cells[1] == f"{100 * results['modes'][mode]['ate_rmse_m']:.2f}"
+    assert table(results["modes"]) in report(*outcome)
+
+
+def test_a_comparison_takes_what_is_finished_and_puts_it_side_by_side(finished, tmp_path, figures):
+    for k, mode in enumerate(MODES):
+        copy = shutil.copytree(finished.folder, tmp_path / "all" / mode)
+        config, settings, results = (
+            json.loads((copy / f"{name}.json").read_text()) for name in ("config", "settings", "results")
+        )
+        config["slam"]["imu"] = settings["imu"] = results["imu"]["mode"] = mode
+        results["ate_rmse_m"] = 0.01 * (k + 1)
+        for name, content in (("config", config), ("settings", settings), ("results", results)):
+            (copy / f"{name}.json").write_text(json.dumps(content))
+    tracked = []
+    config = imu_slam.Config(smoke=True, compare=True, resume=True, out=tmp_path / "all")
+    outcome = imu_slam.run(config, lambda mode, progress: tracked.append(mode))
+    assert tracked == []  # all were finished
+    assert_side_by_side(outcome)
+    curves, bars = figures[-1].axes
+    assert [text.get_text() for text in bars.get_yticklabels()] == MODES[::-1]
+    estimate, ground_truth = (
+        trajectories.read_tum(finished.folder / f"{name}.txt").T for name in ("trajectory", "reference")
+    )
+    errors = trajectory_error.ate(estimate, ground_truth).errors
+    for curve in curves.lines[: len(MODES)]:
+        np.testing.assert_allclose(curve.get_ydata(), 100 * errors, rtol=1e-3)
+
+
+@pytest.mark.slow
+def test_a_comparison_tracks_with_every_mode(tmp_path):
+    outcome = imu_slam.run(imu_slam.Config(smoke=True, compare=True, out=tmp_path / "all"))
+    assert_side_by_side(outcome)
+    for mode in MODES:
+        results = outcome.results["modes"][mode]
+        assert results["imu"]["mode"] == mode and results["frames_lost"] == 0
+        assert results["ate_rmse_m"] < 0.02
 
 
 def test_imu_is_simulated_before_thinning(folder):

@@ -250,7 +250,8 @@ def test_a_weight_of_one_is_one_sigma():
     assert loose.std() / sigmas.loose == pytest.approx(1, rel=0.1)
     assert tight.std() / sigmas.tight == pytest.approx(1, rel=0.02)
     assert accelerometer.std() / sigmas.accelerometer == pytest.approx(1, rel=0.02)
-    assert residual_sigmas(noise, rate_hz, 0.0).loose > 0
+    one_sample = noise.gyro_density / np.sqrt(rate_hz)
+    assert residual_sigmas(noise, rate_hz, 0.0).loose == pytest.approx(one_sample)
     assert residual_sigmas(QUIET, rate_hz, 1.0) == (0, 0, 0)
 
 

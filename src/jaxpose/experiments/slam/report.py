@@ -2,7 +2,7 @@
 
 import math
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -157,7 +157,7 @@ def _map(quality: dict[str, Any]) -> list[str]:
     return [_line("map", "; ".join(words)), _line("", quality["protocol"])]
 
 
-def _ending(folder: Path, results: dict[str, Any], notes: tuple[str, ...], picture: str) -> list[str]:
+def _ending(folder: Path, results: dict[str, Any], notes: Sequence[str], picture: str) -> list[str]:
     cost = f"{results['wall_s']:.0f} s in all, {results['peak_rss_bytes'] / 2**30:.2f} GiB of memory at most"
     lines = [_line("cost", cost), *(_line("note", note) for note in notes)]
     pictures = sorted(str(path.relative_to(folder)) for path in folder.glob("*.png"))
