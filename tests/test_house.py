@@ -41,12 +41,12 @@ SILENT = {f"{room}.{name}" for room, names in {
         "project_onto_poses refine set_progress stop_rotation table velocity write_field"
     ),
     "files": (
-        "associate load nearest orthonormal peak_rss_bytes read_camera read_euroc read_kitti read_points "
-        "read_stamps read_trajectory read_tum run_folder save versions write_camera write_colmap "
-        "write_euroc write_kitti write_ply write_tum"
+        "associate folder_path load nearest opened orthonormal peak_rss_bytes read_camera read_euroc "
+        "read_kitti read_points read_stamps read_trajectory read_tum save versions write_camera "
+        "write_colmap write_euroc write_kitti write_ply write_tum"
     ),
     "imu": (
-        "accelerometer_residual add_noise backward difference filter_imu forward gravity_note "
+        "accelerometer_residual add_noise backward covers difference filter_imu forward gravity_note "
         "gyro_loose_residual gyro_tight_residual imu_residuals integrate_gyro interpolant propagate "
         "remove_gravity residual_sigmas retract rotate simulate simulate_from_poses transition windows"
     ),
@@ -59,7 +59,7 @@ SILENT = {f"{room}.{name}" for room, names in {
         "reconstruction renders trajectory windows"
     ),
     "scenes": "bounding_grid grid grow image merge nerf node_positions node_shape trilinear",
-    "slam": "load run save",
+    "slam": "finish load run save",
     "training": (
         "asynchronous_pairs draw_depths joint microbatched_sum pixel_ray ray_colour trainer viewer "
         "window_pairs"
