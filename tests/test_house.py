@@ -50,10 +50,7 @@ SILENT = {f"{room}.{name}" for room, names in {
         "gyro_loose_residual gyro_tight_residual imu_residuals integrate_gyro interpolant propagate "
         "remove_gravity residual_sigmas retract rotate simulate simulate_from_poses transition windows"
     ),
-    "jaxpose": (
-        "composite density_weights occupancy_weights render_ray sample_depths sdf_weights "
-        "surface_weights weighted_mean"
-    ),
+    "jaxpose": "weighted_mean",
     "plots": (
         "balance cameras comparison corner_errors curves errors freedom held_out inertial preview "
         "reconstruction renders trajectory windows"

@@ -262,3 +262,74 @@ def test_a_ray_of_any_length_sees_the_same_fog(dtype):
     long = render_ray(fog, Ray(origin, 2 * direction), depths / 2, weights=weights)
     halved = short._replace(depth=short.depth / 2, variance=short.variance / 4)
     chex.assert_trees_all_close(long, halved, rtol=RTOL[dtype])
+
+
+WEIGHTS = {
+    "density": lambda distance, depth: density_weights(jax.nn.softplus(-50 * distance), depth),
+    "occupancy": lambda distance, depth: occupancy_weights(jax.nn.sigmoid(-distance / 0.02), depth),
+    "surface": surface_weights(0.05),
+    "thin surface": surface_weights(1e-3),
+}
+
+
+@pytest.mark.parametrize("weights", WEIGHTS.values(), ids=WEIGHTS.keys())
+def test_gradients_are_finite_where_compiled(weights):
+    """Rays that start outside, inside and beyond a corner of a room, and end in a wall or nowhere.
+
+    The compiled gradient is that of the same rays in float64, op by op. A scene's `jnp.min` is what the
+    compiler of JAX 0.12 once made NaN of.
+    """
+    walls = np.array([0.6, 0.4, 2.0])
+
+    def corner(point, direction):
+        del direction
+        return jnp.min(jnp.asarray(walls, point.dtype) - point), 0.5 + 0.3 * jnp.sin(4 * point)
+
+    def loss(T_world_cam, direction_cam):
+        direction = jnp.einsum("ij,j->i", T_world_cam[:3, :3], direction_cam, precision="highest")
+        depths = jnp.linspace(0.5, 3.5, 41, dtype=direction.dtype)
+        seen = render_ray(corner, Ray(T_world_cam[:3, 3], direction), depths, weights=weights)
+        return jnp.sum(seen.rgb**2) + seen.depth + seen.opacity
+
+    T = np.tile(np.eye(4), (4, 1, 1))
+    T[:, :3, 3] = [[0, 0, 0], [1e-6, 1e-6, 1e-6], [0, 0.1, 1.8], [2, 2, 5]]
+    x, y = np.meshgrid(np.linspace(-0.6, 0.6, 10), np.linspace(-0.5, 0.5, 8))
+    directions = np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1)
+    gradients = jax.vmap(jax.vmap(jax.grad(loss), (None, 0)), (0, None))
+    found = jax.jit(gradients)(jnp.asarray(T, jnp.float32), jnp.asarray(directions, jnp.float32))
+    assert np.isfinite(found).all()
+    with jax.enable_x64(True):
+        expected = np.asarray(gradients(jnp.asarray(T), jnp.asarray(directions)))
+    scale = np.abs(expected).max()
+    assert (
+        np.median(np.abs(found - expected)) < 1e-5 * scale and np.abs(found - expected).mean() < 1e-3 * scale
+    )
+
+
+@pytest.mark.parametrize(
+    "call, message",
+    [
+        (lambda: render.sample_depths(None, 1.0, 2.0, 0), "samples: expected at least 1, got 0"),
+        (lambda: render.sample_depths(None, 1.0, 2.0, 4, spacing="log"), "spacing: expected"),
+        (lambda: density_weights(jnp.ones(3), jnp.ones(4)), r"density, depth: .*got \(3,\) and \(4,\)"),
+        (lambda: occupancy_weights(jnp.ones((2, 3)), jnp.ones((2, 3))), "occupancy, depth: .*vmap"),
+        (lambda: sdf_weights(jnp.ones(3), jnp.ones(3), width=0.0), "width: expected more than 0 m, got 0.0"),
+        (lambda: surface_weights(-1.0), "width: expected more than 0 m, got -1.0"),
+        (lambda: composite(jnp.ones(3), jnp.ones(3), jnp.ones((4, 3))), r"rgb: expected shape \(3, 3\)"),
+        (
+            lambda: render_ray(
+                wall, Ray(jnp.ones((5, 3)), jnp.ones((5, 3))), jnp.ones(3), weights=density_weights
+            ),
+            r"ray: expected one, .*got \(5, 3\) and \(5, 3\)",
+        ),
+        (
+            lambda: render_ray(
+                wall, Ray(jnp.ones(3), jnp.ones(3)), jnp.ones((5, 3)), weights=density_weights
+            ),
+            r"depth: expected shape \(samples,\), got \(5, 3\)",
+        ),
+    ],
+)
+def test_input_that_means_nothing_is_named(call, message, unchecked):
+    with pytest.raises(ValueError, match=message):
+        call()

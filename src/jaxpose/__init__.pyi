@@ -37,6 +37,7 @@ from .render import Rendered as Rendered
 from .render import composite as composite
 from .render import density_weights as density_weights
 from .render import occupancy_weights as occupancy_weights
+from .render import pixel_ray as pixel_ray
 from .render import render_ray as render_ray
 from .render import sample_depths as sample_depths
 from .render import surface_weights as surface_weights
