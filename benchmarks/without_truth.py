@@ -12,7 +12,8 @@ import tyro
 
 from jaxpose.evaluation import trajectory_error
 from jaxpose.experiments.imu_slam import Config
-from jaxpose.experiments.slam.options import load, slam_config
+from jaxpose.experiments.slam.options import slam_config
+from jaxpose.experiments.slam.source import load
 from jaxpose.geometry import rigid
 from jaxpose.slam.initial_pose import first_pose
 from jaxpose.slam.pipeline import run

@@ -61,7 +61,7 @@ def assert_agrees_with_evo(estimate, reference, align, most):
     from evo.tools import file_interface
 
     config = Config(
-        estimate, reference, align=align, max_difference=most, rpe_frames=(1, 10), rpe_metres=(0.5,)
+        estimate, reference, align=align, max_difference_s=most, rpe_frames=(1, 10), rpe_metres=(0.5,)
     )
     ours = evaluate.run(config)
     ground_truth, found = (file_interface.read_tum_trajectory_file(file) for file in (reference, estimate))
@@ -148,7 +148,7 @@ def test_clocks_that_differ(files):
     trajectories.write_tum(files[0], estimate._replace(t=estimate.t - 1.6e9))
     with pytest.raises(DataError, match="expected timestamps within 0.01 s"):
         evaluate.run(Config(*files))
-    found = evaluate.run(Config(*files, time_offset=1.6e9))
+    found = evaluate.run(Config(*files, time_offset_s=1.6e9))
     trajectories.write_tum(files[0], estimate)
     # Timestamps since 1970 are rounded to 0.24 us, and at most that can pair others.
     assert found.ate_m == pytest.approx(evaluate.run(Config(*files)).ate_m)
@@ -181,7 +181,7 @@ def test_a_run_is_asked_at_the_references_own_stamps(run_folder, tmp_path):
         tmp_path / "ground truth.txt",
         trajectories.Trajectory(t, numpy_evaluator.load(run_folder / "field.npz")(t)),
     )
-    config = Config(run_folder, tmp_path / "ground truth.txt", align="none", max_difference=0.05)
+    config = Config(run_folder, tmp_path / "ground truth.txt", align="none", max_difference_s=0.05)
     exact = evaluate.run(config)
     inside = int(((t >= 0) & (t <= 3)).sum())
     assert exact.pairs == inside < 100
@@ -250,13 +250,13 @@ def test_wrong_calls_cost_one_line(files, tmp_path):
     trajectories.write_tum(tmp_path / "broken" / "trajectory.txt", paths()[0])
     (tmp_path / "broken" / "results.json").write_text("{")
     for args, message in (
-        ([], "jaxpose: Expected one of .*eval, export"),
-        (["evaluate"], "eval"),
+        ([], "jaxpose: expected one of .*eval, export.*got nothing"),
+        (["evaluate"], "got evaluate; did you mean eval"),
         (["eval", file], "Missing from jaxpose eval: REFERENCE"),
         (["eval", file, file, "--aling", "se3"], "--align"),
         (["eval", file, file, "--align", "affine"], "expected one of"),
-        (["eval", file, file, "--max-difference", "-1"], "--max-difference: expected 0 or more, got -1.0"),
-        (["eval", file, file, "--rpe-metres", "0"], "--rpe-metres: expected positive numbers, got 0.0"),
+        (["eval", file, file, "--max-difference-s", "-1"], "--max-difference-s: expected at least 0, got -1"),
+        (["eval", file, file, "--rpe-metres", "0"], "--rpe-metres: expected a positive number, got 0.0"),
         (["eval", file, tmp_path / "x"], "x: expected a trajectory file or a run folder, got nothing"),
         (["eval", tmp_path / "folder", file], "with trajectory.txt, got runs in it: none"),
         (["eval", tmp_path / "kitti.txt", file], "kitti.txt: expected 60 poses, as .*, got 10"),
@@ -278,7 +278,14 @@ def test_help_is_quick_and_says_what_there_is():
     )
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert said.endswith("\n[]\n") and "usage: jaxpose eval" in said
-    for word in ("ESTIMATE", "REFERENCE", "--align {none,se3,sim3}", "--max-difference", "--json", "--plot"):
+    for word in (
+        "ESTIMATE",
+        "REFERENCE",
+        "--align {none,se3,sim3}",
+        "--max-difference-s",
+        "--json",
+        "--plot",
+    ):
         assert word in said
     short = subprocess.run([sys.executable, "-m", "jaxpose", "--help"], capture_output=True, text=True)
     assert short.returncode == 0 and "eval" in short.stdout and "export" in short.stdout

@@ -150,7 +150,7 @@ def test_formats_without_stamps_need_a_rate(tmp_path):
     trajectories.write_kitti(tmp_path / "kitti.txt", poses(t))
     config = Config(
         tmp_path / "kitti.txt",
-        rate_hz=10.0,
+        recorded_hz=10.0,
         posenet_octaves=(0,),
         posenet_layers=1,
         bspline_hz=(8.0,),
@@ -175,10 +175,10 @@ def test_real_motion_is_carried_to_millimetres(data_dir):
     [
         (["nowhere.txt"], r"nowhere.txt: expected a trajectory file or a run folder, got nothing"),
         (["short.txt"], r"short.txt.*expected at least 20 poses to fit, got 5"),
-        (["kitti.txt"], r"kitti.txt: expected --rate-hz"),
-        (["ground truth.txt", "--rate-hz", "5"], r"ground truth.txt: expected no --rate-hz"),
+        (["kitti.txt"], r"kitti.txt: expected --recorded-hz"),
+        (["ground truth.txt", "--recorded-hz", "5"], r"ground truth.txt: expected no --recorded-hz"),
         (["ground truth.txt", "--imu", "nowhere"], r"nowhere: expected a folder in the EuRoC"),
-        (["ground truth.txt", "--bspline-hz", "-1"], r"--bspline-hz: expected positive numbers, got -1"),
+        (["ground truth.txt", "--bspline-hz", "-1"], r"--bspline-hz: expected a positive number, got -1"),
         (["ground truth.txt", "--posenet-octaves", "--bspline-hz"], r"--bspline-hz: expected a field to fit"),
         (["ground truth.txt", "--imu", "late"], r"late: expected an IMU on the clock of the poses"),
     ],

@@ -10,7 +10,7 @@ from jaxpose.datasets.rgbd import plain
 from jaxpose.datasets.rgbd import registry as rgbd_registry
 from jaxpose.errors import DataError
 from jaxpose.experiments import imu_slam, rgbd_slam
-from jaxpose.experiments.slam.options import load
+from jaxpose.experiments.slam.source import load
 
 LAYOUTS = {
     "sevenscenes": ["frame-000000.color.png", "frame-000000.depth.png", "camera-intrinsics.txt"],
@@ -99,10 +99,10 @@ def test_a_format_that_is_named_is_taken(desk):
 
 def test_the_commands_find_the_format(desk):
     source = load(rgbd_slam.Config(data=desk, recorded_hz=10.0))
-    assert source.about["format"] == "plain" and source.about["rate_hz"] == pytest.approx(10)
+    assert source.metadata["format"] == "plain" and source.metadata["rate_hz"] == pytest.approx(10)
     assert source.recording.imu is None
     touch(desk, ["rgb.txt"])
-    assert load(rgbd_slam.Config(data=desk, format="plain")).about["format"] == "plain"
+    assert load(rgbd_slam.Config(data=desk, format="plain")).metadata["format"] == "plain"
     assert "simulated at 200 Hz" in load(imu_slam.Config(data=desk, format="plain")).imu
 
 
@@ -136,7 +136,7 @@ def test_the_commands_take_the_recording_s_own_imu(desk, walk, save):
     lines = [f"{timestamp(0) + 5_000_000 * k},1,2,3,1,0,0,0,{','.join('0' * 9)}\n" for k in range(60)]
     (mav0 / "state_groundtruth_estimate0/data.csv").write_text("".join(lines))
     source = load(imu_slam.Config(data=mav0.parent, start=1))
-    assert source.about["format"] == "euroc"
+    assert source.metadata["format"] == "euroc"
     assert source.imu == "200 Hz, the recording's own, as read"
     np.testing.assert_allclose(source.recording.t, np.arange(5) * 0.05, atol=1e-9)
     np.testing.assert_allclose(source.recording.imu.t, np.arange(60) * 0.005 - 0.05, atol=1e-9)

@@ -51,7 +51,7 @@ def test_a_real_clip_with_an_imu(data_dir, tmp_path):
     ],
 )
 def test_cameras_a_fifth_of_the_orbit_away_are_found(tmp_path, steps, degrees, percent):
-    results = noisy_nerf.run(noisy_nerf.Config(steps=steps, settle_steps=0, out=tmp_path / "run")).results
+    results = noisy_nerf.run(noisy_nerf.Config(steps=steps, test_pose_steps=0, out=tmp_path / "run")).results
     assert results["start"]["rotation_error_deg"] > 10 and results["start"]["translation_error_percent"] > 10
     assert results["rotation_error_deg"] < degrees and results["translation_error_percent"] < percent
 

@@ -9,10 +9,10 @@ import pytest
 BEFORE = "import jax; from jaxpose.experiments import command\n"
 LAZY = "from jaxpose.experiments import command\n"
 ACTION = """
-def action():
+def action(on_update):
     import jax
     return str(jax.jit(lambda x: x * 2 + 1)(20.0))
-command.guarded("test", action)
+print(command.guarded("test", action))
 """
 
 

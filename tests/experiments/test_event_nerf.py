@@ -14,9 +14,10 @@ from jaxpose.datasets.synthetic import event_orbit, orbit
 from jaxpose.evaluation import trajectory_error
 from jaxpose.events import log_intensity, mosaic_mask
 from jaxpose.experiments import training_loop
+from jaxpose.experiments.event_nerf import options
 from jaxpose.experiments.event_nerf import pipeline as event_nerf
 from jaxpose.experiments.event_nerf.evaluation import corrected, find_truth
-from jaxpose.experiments.event_nerf.options import Config, load
+from jaxpose.experiments.event_nerf.options import Config, load, studies
 from jaxpose.experiments.event_nerf.report import report, table
 from jaxpose.fields import numpy_evaluator
 from jaxpose.files import trajectories
@@ -71,8 +72,8 @@ def test_positions_are_linear_between_the_known_and_orientations_are_kept():
     assert_allclose(T[5, :3, 3], (ground_truth[0, :3, 3] + ground_truth[10, :3, 3]) / 2)
     off = np.linalg.norm(T[:, :3, 3] - ground_truth[:, :3, 3], axis=1)
     assert off.max() > 4 * (1 - np.cos(np.pi / 6)) * 0.8  # the sagitta of a sixth of the circle
-    assert load(smoke()).about["poses"].startswith("positions known at 10 instants")
-    assert load(smoke(axis_offset_deg=1.0)).about["poses"].startswith("known at all 61 instants")
+    assert load(smoke()).metadata["poses"].startswith("positions known at 10 instants")
+    assert load(smoke(axis_offset_deg=1.0)).metadata["poses"].startswith("known at all 61 instants")
 
 
 def test_a_wrong_axis_turns_every_camera_alike_about_its_own_y_axis():
@@ -89,13 +90,14 @@ def test_a_wrong_axis_turns_every_camera_alike_about_its_own_y_axis():
 def test_what_a_run_leaves(finished):
     outcome, seen = finished
     assert {path.name for path in outcome.folder.iterdir()} == FILES
-    assert seen[-1].step == 100 and np.isfinite(seen[-1].loss)
+    trained = [update for update in seen if update.phase == "training"]
+    assert trained[-1].done == trained[-1].total == 100 and np.isfinite(float(trained[-1].state["loss"]))
     results = outcome.results
     problem = load(smoke())
     ground_truth = find_truth(problem)
     assert ground_truth is not None
     loaded = event_nerf.load_run(outcome.folder)
-    poses = training_loop.pose_reader(loaded.setup.field, ground_truth.t)(loaded.state.pose)
+    poses = training_loop.pose_reader(loaded.model.field, ground_truth.t)(loaded.state.pose)
     errors = trajectory_error.pose_errors(poses, ground_truth.T_world_cam)
     assert errors.rotation_deg == pytest.approx(results["rotation_error_deg"], rel=1e-4)
     assert errors.translation == pytest.approx(results["translation_error"], rel=1e-4)
@@ -131,19 +133,19 @@ def test_a_trajectory_that_is_not_refined_stays(tmp_path):
 
 
 def test_studies_vary_one_thing_for_both_trajectories():
-    runs = event_nerf._study(Config(seed=3), "known")
-    assert list(runs) == [f"known{n}-{pose}" for n in (20, 10, 6) for pose in ("linear", "posenet")]
-    assert (runs["known6-linear"].known, runs["known6-linear"].pose) == (6, "linear")
+    runs = studies(Config(seed=3), "known")
+    assert list(runs) == [f"known{n}_{pose}" for n in (20, 10, 6) for pose in ("linear", "posenet")]
+    assert (runs["known6_linear"].known, runs["known6_linear"].pose) == (6, "linear")
     assert {config.seed for config in runs.values()} == {3}
-    offsets = [config.axis_offset_deg for config in event_nerf._study(Config(), "offset").values()]
+    offsets = [config.axis_offset_deg for config in studies(Config(), "offset").values()]
     assert offsets == [1, 1, 2, 2, 2.85, 2.85]
 
 
 @pytest.mark.slow
 def test_a_study_puts_runs_side_by_side(tmp_path, monkeypatch):
-    monkeypatch.setattr(event_nerf, "_KNOWN", (10,))
+    monkeypatch.setattr(options, "_STUDY_KNOWN", (10,))
     outcome = event_nerf.run(smoke(study="known", out=tmp_path / "both"))
-    assert list(outcome.results["runs"]) == ["known10-linear", "known10-posenet"]
+    assert list(outcome.results["runs"]) == ["known10_linear", "known10_posenet"]
     assert (outcome.folder / "table.md").read_text().strip() in report(*outcome)
 
 
@@ -179,9 +181,10 @@ def test_real_events_with_known_poses(data_dir, tmp_path):
 def test_real_events_with_unknown_poses(data_dir, tmp_path):
     config = smoke(data=data_dir / "ecd_slider_depth", poses="unknown", out=tmp_path / "run")
     outcome = event_nerf.run(config)
-    slide = outcome.results["slide"]
-    assert slide["start_direction_error_deg"] < 5
-    assert slide["contrast"]["1"] > max(slide["contrast"]["0"], slide["contrast"]["-1"])
+    found = outcome.results["displacement"]
+    assert found["start_direction_error_deg"] < 5
+    contrast = {at["multiple"]: at["contrast"] for at in found["contrasts"]}
+    assert contrast[1] > max(contrast[0], contrast[-1])
     assert (outcome.folder / "frames.png").exists() and "n/a" in report(*outcome)
 
 

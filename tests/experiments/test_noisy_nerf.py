@@ -18,10 +18,9 @@ from jaxpose.datasets.photos import blender
 from jaxpose.evaluation import trajectory_error
 from jaxpose.experiments import training_loop
 from jaxpose.experiments.noisy_nerf import pipeline as noisy_nerf
-from jaxpose.experiments.noisy_nerf.options import Config, load
+from jaxpose.experiments.noisy_nerf.model import _SMOKE, build, splined
+from jaxpose.experiments.noisy_nerf.options import _STUDIES, Config, load, studies
 from jaxpose.experiments.noisy_nerf.report import report, table
-from jaxpose.experiments.noisy_nerf.setup import _SMOKE, build, splined
-from jaxpose.experiments.noisy_nerf.studies import STUDIES
 from jaxpose.experiments.training_loop import NetConfig
 from jaxpose.fields import numpy_evaluator
 from jaxpose.fields.serialization import write_field
@@ -37,7 +36,7 @@ FILES = {
 
 
 def smoke(**changes):
-    return Config(smoke=True, settle_steps=2, **changes)
+    return Config(smoke=True, test_pose_steps=2, **changes)
 
 
 complaint = partial(refused.complaint, noisy_nerf.main)
@@ -59,7 +58,7 @@ def test_noise_is_on_the_side_and_as_large_as_stated(side):
     off = to_start if side == "camera" else np.linalg.inv(to_start)  # world-to-camera: T_c,w . T_noise
     assert np.linalg.norm(off[:, :3, 3], axis=1).max() == pytest.approx(0.8)
     assert np.degrees(rigid.rotation_angle(off[:, :3, :3], np.eye(3))).max() == pytest.approx(30)
-    assert side in problem.about["noise"] and "seed 3" in problem.about["noise"]
+    assert side in problem.metadata["noise"] and "seed 3" in problem.metadata["noise"]
     assert_array_equal(
         load(smoke(noise_translation=0.1, noise_rotation_deg=30.0, side=side, seed=3)).T_start,
         problem.T_start,
@@ -80,39 +79,39 @@ def test_other_starts():
     assert len(load(smoke(every=2)).train.t) == 4
 
 
-@pytest.mark.parametrize("pose", ["posenet", "table", "bspline", "spline_reset"])
+@pytest.mark.parametrize("pose", ["posenet", "per_frame", "bspline", "spline_reset"])
 def test_every_field_starts_at_the_noisy_poses(pose):
     config = smoke(pose=pose)
     problem = load(config)
-    setup = build(config, problem)
-    poses = training_loop.pose_reader(setup.field, problem.train.t)(setup.field.init(jax.random.key(0)))
+    model = build(config, problem)
+    poses = training_loop.pose_reader(model.field, problem.train.t)(model.field.init(jax.random.key(0)))
     assert_allclose(poses, problem.T_start, atol=2e-3)
 
 
 @pytest.mark.parametrize(
     "changes",
     [
-        {"pose": "table", "side": "camera"},
+        {"pose": "per_frame", "side": "camera"},
         {"pose": "spline_reset"},
         {"pose": "bspline", "side": "camera"},
         {"net": NetConfig(window=(0.1, 0.6))},
         {"net": NetConfig(coupled=True, activation="softplus"), "side": "camera"},
     ],
-    ids=["table", "spline_reset", "bspline", "window", "coupled"],
+    ids=["per_frame", "spline_reset", "bspline", "window", "coupled"],
 )
 def test_every_field_is_a_file_for_numpy(tmp_path, changes):
     """To what float32 leaves of a field over 8 scene units; `test_io_field` holds them to 1e-9 in float64."""
     config = smoke(noise_rotation_deg=20.0, **changes)
     problem = load(config)
-    setup = build(config, problem)
-    leaves, tree = jax.tree.flatten(setup.field.init(jax.random.key(0)))
+    model = build(config, problem)
+    leaves, tree = jax.tree.flatten(model.field.init(jax.random.key(0)))
     rng = np.random.default_rng(0)
     leaves = [leaf + jnp.asarray(0.1 * rng.normal(size=leaf.shape), leaf.dtype) for leaf in leaves]
     params = jax.tree.unflatten(tree, leaves)
     span = (float(problem.train.t[0]), float(problem.train.t[-1]))
-    write_field(tmp_path / "field.npz", span, setup.factors(params))
+    write_field(tmp_path / "field.npz", span, model.factors(params))
     t = np.linspace(span[0] - 0.1, span[1] + 0.1, 41).astype(np.float32)
-    poses = np.asarray(jax.jit(jax.vmap(setup.field.pose, (None, 0)))(params, jnp.asarray(t)))
+    poses = np.asarray(jax.jit(jax.vmap(model.field.pose, (None, 0)))(params, jnp.asarray(t)))
     assert_allclose(numpy_evaluator.load(tmp_path / "field.npz")(t), poses, atol=1e-5)
 
 
@@ -133,10 +132,13 @@ def test_a_table_reset_to_a_spline():
 
 def test_studies_are_the_papers_tables():
     base = Config(seed=5)
-    sizes = {name: len(study(base)) for name, study in STUDIES.items()}
+    sizes = {name: len(studies(base, name)) for name in _STUDIES}
     assert sizes == {"fields": 4, "encoding": 9, "size": 4, "spline": 6, "ablations": 18}
-    assert all(config.seed == 5 for study in STUDIES.values() for config in study(base).values())
-    assert STUDIES["encoding"](base)["sin5-D"].net == NetConfig() == STUDIES["size"](base)["8x256"].net
+    configs = {name: studies(base, name) for name in _STUDIES}
+    assert all(
+        run.seed == 5 and label.isidentifier() for some in configs.values() for label, run in some.items()
+    )
+    assert configs["encoding"]["sin5"].net == NetConfig() == configs["size"]["layers8_width256"].net
 
 
 # --- the run folder --------------------------------------------------------------------------------------
@@ -144,14 +146,14 @@ def test_studies_are_the_papers_tables():
 
 def numbers(results):
     """What must not depend on how a run was cut into pieces."""
-    keys = ("rotation_error_deg", "translation_error", "centre_error", "psnr", "ssim", "settled")
+    keys = ("rotation_error_deg", "translation_error", "centre_error", "psnr", "ssim", "test_time_refined")
     history = np.array(results["history"], float)[:, :4]
     return {key: results[key] for key in keys} | {"history": history.tolist()}
 
 
 @pytest.mark.slow
 def test_a_killed_run_resumed_has_the_numbers_of_a_whole_one(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("jaxpose.experiments.noisy_nerf.setup._SMOKE", build_three_chunks())
+    monkeypatch.setattr("jaxpose.experiments.noisy_nerf.model._SMOKE", build_three_chunks())
     monkeypatch.setattr("jaxpose.experiments.training_loop._SAVE_EVERY_S", 0.0)
     whole = noisy_nerf.run(smoke(pose="spline_reset", out=tmp_path / "whole"))
     assert {path.name for path in whole.folder.iterdir()} == FILES
@@ -162,15 +164,15 @@ def test_a_killed_run_resumed_has_the_numbers_of_a_whole_one(tmp_path, monkeypat
     class Killed(Exception):
         pass
 
-    def kill(progress):
-        if progress.step == 200:
+    def kill(update):
+        if update.phase == "training" and update.done == 200:
             raise Killed
 
     out = tmp_path / "cut"
     with pytest.raises(Killed):
         noisy_nerf.run(smoke(pose="spline_reset", out=out), kill)
     assert (out / "checkpoint.npz").exists() and not (out / "results.json").exists()
-    again = ["--smoke", "--settle-steps", "2", "--pose", "spline_reset", "--out", str(out), "--resume"]
+    again = ["--smoke", "--test-pose-steps", "2", "--pose", "spline_reset", "--out", str(out), "--resume"]
     noisy_nerf.main(again)
     said = capsys.readouterr()
     assert "SMOKE" in said.out and str(out) in said.out and "| spline_reset" in said.out
@@ -191,7 +193,7 @@ def build_three_chunks():
 
 @pytest.mark.slow
 def test_sigkill_in_the_middle_changes_no_number(tmp_path):
-    args = "--orbit-views 10 --image-width 24 --rays 256 --settle-steps 2"
+    args = "--orbit-views 10 --image-width 24 --rays 256 --test-pose-steps 2"
     whole, killed = whole_and_killed("noisy_nerf", args, 1500, tmp_path)
     assert numbers(killed) == numbers(whole)
 
@@ -218,36 +220,40 @@ def test_what_a_run_leaves(tmp_path):
         "images of 24 pixels are too small for LPIPS"
     )
     loaded = noisy_nerf.load_run(outcome.folder)
-    poses = training_loop.pose_reader(loaded.setup.field, loaded.problem.train.t)(loaded.state.pose)
+    poses = training_loop.pose_reader(loaded.model.field, loaded.problem.train.t)(loaded.state.pose)
     assert trajectory_error.pose_errors(poses, reference.T).rotation_deg == pytest.approx(
         errors.rotation_deg, rel=1e-4
     )
     t = np.linspace(0, problem.train.t[-1], 30).astype(np.float32)
-    anywhere = jax.jit(jax.vmap(loaded.setup.field.pose, (None, 0)))(loaded.state.pose, jnp.asarray(t))
+    anywhere = jax.jit(jax.vmap(loaded.model.field.pose, (None, 0)))(loaded.state.pose, jnp.asarray(t))
     aligned = trajectory_error.align(
         trajectory_error.procrustes(poses, reference.T), np.asarray(anywhere, np.float64)
     )
     assert_allclose(numpy_evaluator.load(outcome.folder / "field.npz")(t), aligned, atol=3e-5)
     camera, images, folder = read_camera(outcome.folder / "camera.json")
     assert camera == problem.train.camera and images == problem.train.files and folder == outcome.folder
-    density, _ = loaded.setup.scene.query(loaded.state.scene, jnp.zeros(3), jnp.ones(3))
+    density, _ = loaded.model.scene.query(loaded.state.scene, jnp.zeros(3), jnp.ones(3))
     assert np.isfinite(density) and float(loaded.state.scene["progress"]) == 1
-    assert results["settled"]["psnr"] > 0 and results["wall_s"] > 0 and results["versions"]["jax"]
+    assert results["test_time_refined"]["psnr"] > 0 and results["wall_s"] > 0 and results["versions"]["jax"]
 
 
 @pytest.mark.slow
 def test_a_study_puts_runs_side_by_side(tmp_path, monkeypatch):
-    every = STUDIES["fields"]
-    two = lambda config: {name: every(config)[name] for name in ("table", "bspline")}
-    monkeypatch.setitem(noisy_nerf.STUDIES, "fields", two)
+    every = _STUDIES["fields"]
+    two = lambda config: {name: every(config)[name] for name in ("per_frame", "bspline")}
+    monkeypatch.setitem(_STUDIES, "fields", two)
     seen = []
     outcome = noisy_nerf.run(
-        smoke(study="fields", out=tmp_path / "both"), lambda progress: seen.append(progress.label)
+        smoke(study="fields", out=tmp_path / "both"), lambda update: seen.append(update.phase)
     )
     assert {path.name for path in outcome.folder.iterdir()} == {
-        "table", "bspline", "table.md", "curves.png", "config.json", "results.json",
+        "per_frame", "bspline", "table.md", "curves.png", "config.json", "results.json",
     }  # fmt: skip
-    assert seen == ["table", "bspline"] and set(outcome.results["runs"]) == {"table", "bspline"}
+    assert [phase for phase in seen if phase.startswith("training")] == [
+        "training per_frame",
+        "training bspline",
+    ]
+    assert set(outcome.results["runs"]) == {"per_frame", "bspline"}
     assert table(outcome.results["runs"]) in report(*outcome)
     assert (
         json.loads((outcome.folder / "bspline" / "results.json").read_text())["training"]["pose"] == "bspline"
@@ -260,7 +266,7 @@ def test_a_study_puts_runs_side_by_side(tmp_path, monkeypatch):
     ("scene", "noise", "views"), [("nerf_synthetic_lego", "independent", 8), ("llff_fern", "unknown", 8)]
 )
 def test_real_photographs(data_dir, tmp_path, scene, noise, views):
-    config = smoke(data=data_dir / scene, noise=noise, out=tmp_path / "run", pose="table")
+    config = smoke(data=data_dir / scene, noise=noise, out=tmp_path / "run", pose="per_frame")
     results = noisy_nerf.run(config).results
     assert results["data"]["images"] == views and results["rotation_error_deg"] < 180
     poses = json.loads((tmp_path / "run" / "transforms.json").read_text())["frames"]
@@ -276,7 +282,7 @@ def test_unknown_poses_start_before_the_middle_of_disparity(data_dir):
 @pytest.mark.data
 @pytest.mark.slow
 def test_unknown_poses_of_a_forward_facing_scene_are_found(data_dir, tmp_path):
-    config = Config(data=data_dir / "llff_fern", noise="unknown", steps=1000, settle_steps=0, out=tmp_path)
+    config = Config(data=data_dir / "llff_fern", noise="unknown", steps=1000, test_pose_steps=0, out=tmp_path)
     results = noisy_nerf.run(config).results
     assert results["start"]["translation_error_percent"] > 25
     assert results["translation_error_percent"] < 8 and results["rotation_error_deg"] < 20
@@ -295,6 +301,9 @@ def test_unknown_poses_of_a_forward_facing_scene_are_found(data_dir, tmp_path):
         (["--noise-translation", "-0.1"], r"--noise-translation: expected at least 0, got -0.1"),
         (["--noise-sigma", "nan"], r"--noise-sigma: expected at least 0, got nan"),
         (["--spline-smoothing", "0"], r"--spline-smoothing: expected a positive number, got 0"),
+        (["--pose", "per_frame", "--net.width", "9"], r"--net.width: has no effect with --pose per_frame"),
+        (["--spline-knots", "9"], r"--spline-knots: has no effect with --pose posenet"),
+        (["--noise-sigma", "1"], r"--noise-sigma: has no effect with --noise correlated"),
         (["--data", "nowhere"], r"nowhere: expected a folder of photographs, or orbit, got nothing"),
         (["--resume"], r"--resume: expected --out DIR or --name NAME"),
         (["--smoke", "--every", "5"], r"expected at least 4 images to train on, got 2"),

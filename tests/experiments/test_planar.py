@@ -28,7 +28,7 @@ from jaxpose.files import atomic
 from jaxpose.geometry import se3
 from jaxpose.scenes._image import ImageConfig, image
 
-POSES = ("posenet", "table", "spline_reset", "bspline")
+POSES = ("posenet", "per_frame", "spline_reset", "bspline")
 NET = PoseNetConfig(layers=2, width=16)
 FILES = {"config.json", "results.json", "corner_errors.png", "motions", "motion_00.png", "motion_01.png"}
 
@@ -187,7 +187,7 @@ def test_the_gauge_is_the_first_patchs_inverse():
 
 
 def test_the_first_row_of_a_table_gets_no_gradient():
-    for warps in (planar_warps.motion_warps("table", 7, NET), planar_warps.homography_warps(5)):
+    for warps in (planar_warps.motion_warps("per_frame", 7, NET), planar_warps.homography_warps(5)):
         params = warps.init(jax.random.key(0)) + 0.1
         gradient = jax.jit(jax.grad(lambda p, warps=warps: jnp.sum(warps.warps(p) ** 2)))(params)
         assert np.all(gradient[0] == 0) and np.abs(gradient[1:]).max() > 0.1
@@ -224,7 +224,7 @@ def aligned(pose, photo, steps=200, **moved):
     return alignment.align(compiled, photo, task, jax.random.key(0), steps), task, compiled
 
 
-@pytest.mark.parametrize("pose", ["posenet", "table"])
+@pytest.mark.parametrize("pose", ["posenet", "per_frame"])
 def test_small_motions_are_found(pose):
     photo = Photo(blobs() / 255, 32)
     moved = dict(x=(0, 0.08, 0.12), y=(0, -0.06, 0.05), angle=(0, 0.1, -0.15))
@@ -264,8 +264,8 @@ def test_a_killed_run_resumed_has_the_numbers_of_a_whole_one(photograph, tmp_pat
     class Killed(Exception):
         pass
 
-    def kill(progress):
-        if progress.motion == 1:
+    def kill(update):
+        if update.phase == "spline_reset 2/2":
             raise Killed
 
     out = tmp_path / "cut"
@@ -327,7 +327,7 @@ def test_homographies(found_at_once, photograph, tmp_path):
     outcome = planar.run(
         planar.Config(image=photograph, setup="homography", motions=1, smoke=True, out=tmp_path / "h")
     )
-    assert outcome.results["pose"] == "table" and outcome.results["protocol"]["patches"] == 5
+    assert outcome.results["pose"] == "per_frame" and outcome.results["protocol"]["patches"] == 5
     assert "homography set-up, 5 patches of 32 px" in report(*outcome)
 
 
@@ -339,10 +339,10 @@ def test_homographies(found_at_once, photograph, tmp_path):
         (["--motions", "0"], r"--motions: expected at least 1, got 0"),
         (["--points", "0"], r"--points: expected at least 1, got 0"),
         (["--steps", "120"], r"--steps: expected a multiple of 50, got 120"),
-        (["--seed", "-1"], r"--seed: expected 0 or more, got -1"),
-        (["--setup", "homography", "--pose", "posenet"], r"homography: expected --pose table"),
-        (["--setup", "homography", "--compare"], r"homography: expected --pose table and no --compare"),
-        (["--compare", "--pose", "table"], r"--compare: expected no --pose.*got table"),
+        (["--seed", "-1"], r"--seed: expected at least 0, got -1"),
+        (["--setup", "homography", "--pose", "posenet"], r"homography: expected --pose per_frame"),
+        (["--setup", "homography", "--compare"], r"homography: expected --pose per_frame and no --compare"),
+        (["--compare", "--pose", "per_frame"], r"--compare: expected no --pose.*got per_frame"),
         (["--image", "nowhere.png"], r"nowhere\.png"),
     ],
 )

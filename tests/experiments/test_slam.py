@@ -21,14 +21,14 @@ from jaxpose.datasets.types import Recording
 from jaxpose.errors import DataError
 from jaxpose.evaluation import trajectory_error
 from jaxpose.experiments import imu_slam, rgbd_slam
-from jaxpose.experiments.slam import pipeline as slam_pipeline
-from jaxpose.experiments.slam.options import load
-from jaxpose.experiments.slam.report import progress_bar, report, table
+from jaxpose.experiments.outcome import Outcome
+from jaxpose.experiments.slam import run_files
+from jaxpose.experiments.slam.report import report, table, tracking_update
+from jaxpose.experiments.slam.source import load
 from jaxpose.fields import numpy_evaluator
 from jaxpose.files import atomic, trajectories
 from jaxpose.files.camera_json import read_camera
-from jaxpose.slam.pipeline import Progress
-from jaxpose.slam.types import no_frames
+from jaxpose.slam import Progress
 
 README = Path(__file__).parents[2] / "README.md"
 FRAMES = 8
@@ -61,7 +61,7 @@ def folder(tmp_path, recording) -> Path:
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory) -> slam_pipeline.Outcome:
+def finished(tmp_path_factory) -> Outcome:
     """`imu_slam --smoke`."""
     out = tmp_path_factory.mktemp("runs") / "imu"
     return imu_slam.run(imu_slam.Config(smoke=True, out=out))
@@ -97,7 +97,7 @@ def test_numbers_are_those_of_the_files(finished):
 
 def test_a_saved_field_gives_the_trajectory_at_any_time(finished):
     folder, results = finished
-    field, params = slam_pipeline.load_field(folder)
+    field, params = run_files.load_field(folder)
     estimate = trajectories.read_tum(folder / "trajectory.txt")
     times = np.concatenate([estimate.t, np.linspace(0, estimate.t[-1], 50)]).astype(np.float32)
     poses = np.asarray(jax.jit(jax.vmap(field.pose, (None, 0)))(params, jnp.asarray(times)))
@@ -109,7 +109,7 @@ def test_a_saved_field_gives_the_trajectory_at_any_time(finished):
 def test_a_field_of_before_is_refused(tmp_path):
     np.savez(tmp_path / "field.npz", control_points=np.zeros((5, 7)), span=np.zeros(2))
     with pytest.raises(DataError, match="field.npz: expected a B-spline in a trajectory of version 1"):
-        slam_pipeline.load_field(tmp_path)
+        run_files.load_field(tmp_path)
 
 
 def test_a_run_says_what_camera_it_had(finished):
@@ -132,7 +132,7 @@ def test_rgbd_slam_on_a_folder(folder, tmp_path, capsys):
     )
     said = capsys.readouterr()
     assert "office/seq-01" in said.out and "IMU none" in said.out
-    assert "8/8" in said.err  # the bar
+    assert "tracking, IMU none  8/8 frames" in said.err
     assert {path.name for path in out.iterdir()} == FILES | {"freedom.png"}  # and no picture of an IMU
     results = json.loads((out / "results.json").read_text())
     dof = results["degrees_of_freedom"]
@@ -146,14 +146,12 @@ def test_rgbd_slam_on_a_folder(folder, tmp_path, capsys):
     )
 
 
-def test_the_progress_of_a_resumed_run_begins_where_it_goes_on(capsys):
-    """Its first frame is not frame 0."""
-    frames = no_frames(5)._replace(lost=np.array([True, False, True, False, False]))
-    on_frame = progress_bar()
-    for index in (3, 4):
-        on_frame("none", Progress(index, 5, SimpleNamespace(frames=frames), 0.01))
-    said = capsys.readouterr().err
-    assert "5/5" in said and "lost=2" in said and "1.0 cm" in said
+def test_the_progress_of_a_resumed_run_begins_where_it_goes_on():
+    """Its first frame is not frame 0, and frames lost before count."""
+    frames = SimpleNamespace(lost=np.array([True, False, True, False]), loss=np.full(4, 0.5))
+    update = tracking_update("none", Progress(3, 5, SimpleNamespace(frames=frames), 0.01))
+    assert (update.done, update.total) == (4, 5)
+    assert update.state == {"loss": "0.50", "off": "1.0 cm", "lost": "2"}
 
 
 MODES = ["none", "loose", "tight", "accelerometer", "combined"]
@@ -187,8 +185,8 @@ def test_a_comparison_takes_what_is_finished_and_puts_it_side_by_side(finished, 
             (copy / f"{name}.json").write_text(json.dumps(content))
     tracked = []
     config = imu_slam.Config(smoke=True, compare=True, resume=True, out=tmp_path / "all")
-    outcome = imu_slam.run(config, lambda mode, progress: tracked.append(mode))
-    assert tracked == []  # all were finished
+    outcome = imu_slam.run(config, lambda update: tracked.append(update.phase))
+    assert not [phase for phase in tracked if phase.startswith("tracking")]  # all were finished
     assert_side_by_side(outcome)
     curves, bars = figures[-1].axes
     assert [text.get_text() for text in bars.get_yticklabels()] == MODES[::-1]
@@ -232,14 +230,38 @@ def test_imu_is_simulated_before_thinning(folder):
         (["--frames", "many"], r"--frames.*many"),
         (["--rate-hz", "0"], r"--rate-hz: expected a positive number, got 0"),
         (["--recorded-hz", "-3"], r"--recorded-hz: expected a positive number, got -3"),
-        (["--start", "-1"], r"--start: expected 0 or more, got -1"),
+        (["--start", "-1"], r"--start: expected at least 0, got -1"),
         (["--frames", "2"], r"--frames: expected at least 3, got 2"),
-        (["--voxel", "0"], r"--voxel: expected a positive number, got 0"),
+        (["--voxel", "0"], r"voxel: expected a positive number, got 0"),
         (["--room.width", "0"], r"RoomConfig.width: expected a positive number, got 0"),
         (["--rate-hz", "0.01"], r"expected two frames"),
-        (["--format", "sevenscenes"], r"expected --data"),
-        (["--format", "room", "--data", "x"], r"expected no --data"),
-        (["--room.along", "x", "--data", "y"], r"--room\.along: expected no --data"),
+        (["--format", "sevenscenes"], r"--format: has no effect without --data"),
+        (["--recorded-hz", "30"], r"--recorded-hz: has no effect without --data"),
+        (["--room.along", "x", "--data", "y"], r"--room\.along: has no effect with --data"),
+        (["--room.width", "100", "--data", "y"], r"--room\.width: has no effect with --data"),
+        (["--room.along", "x", "--room.speed", "2"], r"--room\.speed: has no effect with --room\.along"),
+        (["--imu-rotation", "slerp"], r"--imu-rotation: has no effect where no IMU is simulated"),
+        (
+            ["--imu", "none", "--imu-noise.gyro-walk", "0"],
+            r"--imu-noise\.gyro-walk: has no effect with --imu none",
+        ),
+        (["--compare", "--imu", "none"], r"--imu: has no effect with --compare"),
+        (["--room.rate-hz", "9"], r"--room\.rate-hz: has no effect as --rate-hz sets it"),
+        (["--field.width", "64"], r"--field\.width: has no effect with --track\.method gauss_newton"),
+        (["--frame", "world"], r"--frame world: expected --track\.method gradient"),
+        (["--track.patience", "3"], r"--track\.patience: has no effect with --track\.method gauss_newton"),
+        (
+            ["--track.method", "gradient", "--track.dof-weight", "1"],
+            r"--track\.dof-weight: has no effect without",
+        ),
+        (["--map.pixels", "9"], r"--map\.pixels: has no effect with --map\.method fused"),
+        (["--map.sample.front", "9"], r"--map\.sample\.front: has no effect with --map\.method fused"),
+        (["--track.sample.band", "1"], r"--track\.sample\.band: has no effect as the voxel sets it"),
+        (["--field.window", "0", "1"], r"--field\.window: has no effect as tracking has no"),
+        (["--field.coupled"], r"--field\.coupled: has no effect as tracking has a rate for each"),
+        (["--field.span", "0", "1"], r"--field\.span: has no effect as tracking sets it"),
+        (["--track.method", "gradient", "--field.activation", "relu"], r"expected softplus"),
+        (["--name", "x"], r"--name: expected no --out with it"),
         (["--imu-offset-s", "nan"], r"--imu-offset-s: expected a finite number"),
         (["--data", "nowhere"], r"nowhere: expected a folder of frame-NNNNNN.*got nothing"),
     ],
@@ -264,9 +286,9 @@ def test_bad_recordings_are_one_line(folder, tmp_path):
     for i in range(3, FRAMES):
         (folder / f"frame-{i:06d}.pose.txt").unlink()
     line = ask("--start", 5, main=imu_slam.main)
-    assert re.search(r"IMU: expected readings between 0.000 and 0.400 s .*between -1.000 and -0.600", line), (
-        line
-    )
+    assert re.search(
+        r"expected inertial readings between 0.000 and 0.400 s .*between -1.000 and -0.600", line
+    ), line
     for i in range(3):
         (folder / f"frame-{i:06d}.pose.txt").unlink()
     assert "--imu combined expected true poses to simulate an IMU from" in ask(main=imu_slam.main)
@@ -304,9 +326,9 @@ def test_exit_code_and_streams():
     assert len(bad.stderr.splitlines()) == 1 and "--seed" in bad.stderr
 
 
-def test_help_lists_the_options(capsys):
+def test_help_all_lists_the_options(capsys):
     with pytest.raises(SystemExit) as stop:
-        imu_slam.main(["--help"])
+        imu_slam.main(["--help-all"])
     assert not stop.value.code
     said = capsys.readouterr()
     assert said.err == "" and "usage: python -m jaxpose.experiments.imu_slam" in said.out

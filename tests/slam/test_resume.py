@@ -11,7 +11,8 @@ import pytest
 from jaxpose.datasets.types import select
 from jaxpose.errors import DataError
 from jaxpose.experiments import rgbd_slam
-from jaxpose.experiments.slam.options import load, slam_config
+from jaxpose.experiments.slam.options import slam_config
+from jaxpose.experiments.slam.source import load
 from jaxpose.files import trajectories
 from jaxpose.slam import MapConfig, SlamConfig, TrackingStatus, checkpoint, run
 
@@ -21,13 +22,13 @@ import jax
 jax.config.update("jax_disable_most_optimizations", True)
 from pathlib import Path
 from jaxpose.experiments import rgbd_slam
-from jaxpose.experiments.slam import callbacks
-callbacks.SAVE_EVERY_S = 0.0
-def on_frame(mode, progress):
-    if len(sys.argv) > 2 and progress.index == 4:
+from jaxpose.experiments.slam import checkpointing
+checkpointing.SAVE_EVERY_S = 0.0
+def on_update(update):
+    if len(sys.argv) > 2 and update.done == 5:
         os.kill(os.getpid(), signal.SIGKILL)
 config = rgbd_slam.Config(smoke=True, out=Path(sys.argv[1]), resume=True)
-rgbd_slam.run(config, on_frame)
+rgbd_slam.run(config, on_update)
 """
 
 

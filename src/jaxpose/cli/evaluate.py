@@ -2,10 +2,10 @@
 
 ESTIMATE and REFERENCE are trajectory files (TUM, KITTI, EuRoC or TUM-VI csv, lists of 4x4 matrices: found by
 their content) or run folders of this package. Poses are paired by nearest timestamp, or row by row where a
-format has no timestamps; a run's continuous trajectory is asked at the reference's own timestamps.
+format has no timestamps; a run's continuous trajectory is evaluated at the reference's own timestamps.
 """
 
-import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
@@ -18,7 +18,10 @@ from jaxpose.cli.source import FIELD, Source, read_field, read_source
 from jaxpose.errors import DataError
 from jaxpose.evaluation import trajectory_error
 from jaxpose.evaluation.trajectory_error import Alignment, Statistics
-from jaxpose.experiments.command import markdown_table
+from jaxpose.experiments.checks import check_finite, check_least, check_positive
+from jaxpose.experiments.command import Command, execute
+from jaxpose.experiments.outcome import markdown_table
+from jaxpose.experiments.progress import OnUpdate, Update, silent
 from jaxpose.files import trajectories
 from jaxpose.geometry import rigid
 from jaxpose.geometry.rigid import Similarity
@@ -35,7 +38,9 @@ _ALIGNMENTS = {
 class Config:
     """Settings of a comparison; the two trajectories and these are all that the numbers depend on."""
 
-    estimate: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="ESTIMATE")]  # file or run folder
+    estimate: Annotated[
+        Path, tyro.conf.Positional, tyro.conf.arg(metavar="ESTIMATE")
+    ]  # the trajectory to measure: file or run folder
     # The ground truth, or what is taken for it: file or run folder.
     reference: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="REFERENCE")]
     align: Alignment = "se3"  # how the estimate is moved onto the reference first
@@ -43,8 +48,8 @@ class Config:
     # continuous trajectory of the estimate at the reference's timestamps; auto: exact if the estimate is a
     # run that has one.
     match: Literal["auto", "nearest", "exact"] = "auto"
-    max_difference: float = 0.01  # [s] largest distance of two timestamps that are paired as nearest
-    time_offset: float = 0.0  # [s] added to the timestamps of the estimate
+    max_difference_s: float = 0.01  # [s] largest distance of two timestamps that are paired as nearest
+    time_offset_s: float = 0.0  # [s] added to the timestamps of the estimate
     rpe_frames: tuple[int, ...] = (1,)  # relative errors over so many poses
     rpe_seconds: tuple[float, ...] = (1.0,)  # relative errors over so much time [s]
     rpe_metres: tuple[float, ...] = ()  # relative errors over so much of the reference's path [m]
@@ -52,16 +57,11 @@ class Config:
     json: bool = False  # print the numbers as JSON and nothing else
 
     def __post_init__(self):
-        if not 0 <= self.max_difference < math.inf:
-            raise ValueError(f"--max-difference: expected 0 or more, got {self.max_difference}")
+        check_least(self, max_difference_s=0)
+        check_finite(self, "time_offset_s")
+        check_positive(self, "rpe_frames", "rpe_seconds", "rpe_metres")
         if self.plot is not None and self.plot.suffix != ".png":
             raise ValueError(f"--plot: expected a name that ends in .png, got {self.plot}")
-        if not math.isfinite(self.time_offset):
-            raise ValueError(f"--time-offset: expected a finite number, got {self.time_offset}")
-        for option in ("rpe_frames", "rpe_seconds", "rpe_metres"):
-            for delta in getattr(self, option):
-                if not 0 < delta < math.inf:
-                    raise ValueError(f"--{option.replace('_', '-')}: expected positive numbers, got {delta}")
 
 
 class Relative(NamedTuple):
@@ -100,11 +100,20 @@ class _Pairs(NamedTuple):
     stamped: bool
 
 
-def run(config: Config) -> Result:
+def run(config: Config, on_update: OnUpdate = silent) -> Result:
     """Compare the trajectories that the config names, and draw them if it says so.
 
-    Raises DataError or OSError for what cannot be used.
+    Args:
+        config: the two trajectories, and how to compare them.
+        on_update: called with what is being done.
+
+    Returns:
+        The errors, and how they were measured.
+
+    Raises:
+        DataError, OSError: for what cannot be used.
     """
+    on_update(Update(f"reading {config.estimate} and {config.reference}", quiet=True))
     estimate, reference = read_source(config.estimate), read_source(config.reference)
     pairs = _pair(config, estimate, reference)
     ate = trajectory_error.ate(pairs.estimate, pairs.reference, config.align)
@@ -112,6 +121,7 @@ def run(config: Config) -> Result:
     turned = np.degrees(rigid.rotation_angle(aligned[:, :3, :3], pairs.reference[:, :3, :3]))
     rpe, notes = _relative(config, pairs)
     if config.plot is not None:
+        on_update(Update("drawing figures", quiet=True))
         from jaxpose.plots.evaluation import comparison
 
         comparison(
@@ -137,6 +147,16 @@ def run(config: Config) -> Result:
         notes=notes,
         plot=config.plot,
     )
+
+
+def main(args: Sequence[str] | None = None, prog: str = "jaxpose eval") -> None:
+    """The command `jaxpose eval`.
+
+    Args:
+        args: the command line; None is that of this process.
+        prog: the command as it is typed.
+    """
+    execute(Command(prog, Config, __doc__, run, report), args)
 
 
 def report(result: Result) -> str:
@@ -182,18 +202,17 @@ def _pair(config: Config, estimate: Source, reference: Source) -> _Pairs:
                 f"{estimate.path}: expected {len(t_reference)} poses, as {reference.path} has, to pair them "
                 f"row by row (one of the two has no timestamps), got {len(t_estimate)}"
             )
-        t = t_reference if reference.stamped else t_estimate + config.time_offset
+        t = t_reference if reference.stamped else t_estimate + config.time_offset_s
         stamped = reference.stamped or estimate.stamped
         return _Pairs(t, T_estimate, T_reference, "row by row, as not both have timestamps", stamped)
     # Reference first: of two equally long ones each pose of the estimate takes its nearest, as evo does.
     of_reference, of_estimate = trajectories.associate(
-        t_reference, t_estimate + config.time_offset, config.max_difference
+        t_reference, t_estimate + config.time_offset_s, config.max_difference_s
     )
     fewer = min(len(t_reference), len(t_estimate))
-    how = (
-        f"of {fewer} poses of the shorter one: nearest timestamps, at most {config.max_difference:g} s apart"
-    )
-    how += f"; the estimate's moved by {config.time_offset:g} s" if config.time_offset else ""
+    most = f"at most {config.max_difference_s:g} s apart"
+    how = f"of {fewer} poses of the shorter one: nearest timestamps, {most}"
+    how += f"; the estimate's moved by {config.time_offset_s:g} s" if config.time_offset_s else ""
     return _Pairs(t_reference[of_reference], T_estimate[of_estimate], T_reference[of_reference], how, True)
 
 
@@ -203,18 +222,18 @@ def _exact(config: Config, estimate: Source, reference: Source) -> _Pairs:
     if not reference.stamped:
         raise DataError(f"{reference.path}: expected timestamps for --match exact, got a {reference.what}")
     first, last = estimate.trajectory.t[[0, -1]]
-    t = reference.trajectory.t - config.time_offset
+    t = reference.trajectory.t - config.time_offset_s
     inside = (t >= first) & (t <= last)
     if not inside.any():
         raise DataError(
             f"{reference.path}: expected timestamps from {first:.3f} to {last:.3f} s, as "
             f"{estimate.path} has, "
-            f"got {t[0]:.3f} to {t[-1]:.3f} s; --time-offset brings them to one clock"
+            f"got {t[0]:.3f} to {t[-1]:.3f} s; --time-offset-s brings them to one clock"
         )
     outside = len(t) - int(inside.sum())
     how = f"exact: the continuous trajectory ({FIELD}) at the reference's timestamps"
     how += f"; {outside} timestamps of the reference beyond its ends are left out" if outside else ""
-    how += f"; the estimate's clock moved by {config.time_offset:g} s" if config.time_offset else ""
+    how += f"; the estimate's clock moved by {config.time_offset_s:g} s" if config.time_offset_s else ""
     return _Pairs(reference.trajectory.t[inside], pose(t[inside]), reference.trajectory.T[inside], how, True)
 
 

@@ -1,4 +1,4 @@
-"""Take the trajectory out of a run, in a format that other programs read.
+"""Write the trajectory of a run in a format that other programs read.
 
 RUN is the folder of a run, or a trajectory file (to change its format). Poses are camera-to-world with camera
 axes right, down, forward, in the world of the run's trajectory.txt. They are those of the frames, or of the
@@ -7,6 +7,7 @@ run's continuous trajectory at --rate-hz or at the timestamps of a file (--at).
 
 import os
 import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
@@ -16,6 +17,9 @@ import tyro
 
 from jaxpose.cli.source import FIELD, Source, images_on_disk, read_field, read_source
 from jaxpose.errors import DataError
+from jaxpose.experiments.checks import check_apart, check_positive
+from jaxpose.experiments.command import Command, execute
+from jaxpose.experiments.progress import OnUpdate, Update, silent
 from jaxpose.files import atomic, trajectories, trajectory_reader
 
 if TYPE_CHECKING:
@@ -31,19 +35,19 @@ _OWN = (
 class Config:
     """What to take out of a run, and where to put it."""
 
-    run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]  # folder, or trajectory file
+    run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]  # run folder, or trajectory file
     # tum: `t tx ty tz qx qy qz qw`; kitti: 3x4 matrices without timestamps; euroc: csv with timestamps in ns;
     # transforms: transforms.json for nerfstudio and instant-ngp; colmap: a text model; npz: the continuous
-    # trajectory itself, which jaxpose/numpy_field.py evaluates with numpy alone.
+    # trajectory itself, which `jaxpose/fields/numpy_evaluator.py` evaluates with numpy alone.
     format: Format
     out: Path  # file to write; colmap: folder
-    rate_hz: float | None = None  # poses so often from the first frame on, not at the frames
+    rate_hz: float | None = None  # [Hz] poses at this rate from the first frame on; None: at the frames
     at: Path | None = None  # poses at the timestamps of this file, the first number of each line ([s], or ns)
     json: bool = False  # print what was written as JSON and nothing else
 
     def __post_init__(self):
-        if self.rate_hz is not None and not 0 < self.rate_hz < np.inf:
-            raise ValueError(f"--rate-hz: expected a positive number, got {self.rate_hz}")
+        check_positive(self, "rate_hz")
+        check_apart("--out", self.out, self.run, self.at)
         if self.rate_hz is not None and self.at is not None:
             raise ValueError("--at: expected no --rate-hz with it")
         if self.format in ("transforms", "colmap", "npz") and (self.rate_hz or self.at):
@@ -62,11 +66,20 @@ class Result(NamedTuple):
     notes: tuple[str, ...]
 
 
-def run(config: Config) -> Result:
+def run(config: Config, on_update: OnUpdate = silent) -> Result:
     """Write what the config asks for.
 
-    Raises DataError or OSError for what cannot be had; then nothing is written.
+    Args:
+        config: what to write, and where.
+        on_update: called with what is being done.
+
+    Returns:
+        What was written.
+
+    Raises:
+        DataError, OSError: for what cannot be used; then nothing is written.
     """
+    on_update(Update(f"reading {config.run}", quiet=True))
     source = read_source(config.run)
     if config.format == "npz":
         return _continuous(config, source)
@@ -86,6 +99,16 @@ def run(config: Config) -> Result:
     else:
         notes += _with_images(config, source, trajectory)
     return Result(str(source), config.out, config.format, len(trajectory.t), times, notes)
+
+
+def main(args: Sequence[str] | None = None, prog: str = "jaxpose export") -> None:
+    """The command `jaxpose export`.
+
+    Args:
+        args: the command line; None is that of this process.
+        prog: the command as it is typed.
+    """
+    execute(Command(prog, Config, __doc__, run, report), args)
 
 
 def report(result: Result) -> str:

@@ -1,64 +1,77 @@
-"""Camera trajectories: check data, find a field that carries a motion, compare, take out and look at a run.
+"""The command `jaxpose`: its subcommands, each loaded only when it is asked for."""
 
-`jaxpose COMMAND --help` tells what a command takes. The experiments that make runs are
-`python -m jaxpose.experiments.rgbd_slam`, `imu_slam`, `noisy_nerf`, `event_nerf` and `planar`.
-"""
-
+import difflib
 import sys
 from collections.abc import Sequence
-from typing import Annotated, Any
+from typing import NamedTuple
 
-import tyro
+import jaxpose
 
-from jaxpose.cli import evaluate, export
-from jaxpose.cli.check import command as check
-from jaxpose.cli.fit import command as fit
-from jaxpose.cli.view import command as view
-from jaxpose.experiments import command
-from jaxpose.files.atomic import json_text
 
-_MODULES = {
-    check.Config: ("check", check),
-    fit.Config: ("fit", fit),
-    evaluate.Config: ("eval", evaluate),
-    export.Config: ("export", export),
-    view.Config: ("view", view),
+class _Subcommand(NamedTuple):
+    module: str  # with `main(args, prog=...)`
+    summary: str
+
+
+_GROUPS = {
+    "make runs": {
+        "slam": _Subcommand(
+            "jaxpose.experiments.slam.command", "track an RGB-D camera, with or without an IMU"
+        ),
+        "nerf": _Subcommand(
+            "jaxpose.experiments.noisy_nerf.pipeline", "NeRF from photographs with noisy or unknown poses"
+        ),
+        "events": _Subcommand(
+            "jaxpose.experiments.event_nerf.pipeline", "NeRF from the events of an event camera"
+        ),
+        "planar": _Subcommand(
+            "jaxpose.experiments.planar.pipeline", "align patches of one photograph in the plane"
+        ),
+    },
+    "data and trajectories": {
+        "check": _Subcommand("jaxpose.cli.check.command", "find faults in a recording or a trajectory"),
+        "fit": _Subcommand("jaxpose.cli.fit.command", "compare pose fields on a trajectory"),
+        "eval": _Subcommand("jaxpose.cli.evaluate", "errors of a trajectory against a reference"),
+        "export": _Subcommand("jaxpose.cli.export", "write the trajectory of a run in another format"),
+        "view": _Subcommand("jaxpose.cli.view.command", "show a run in the browser, or save it as a page"),
+    },
 }
-# All that the command line can ask for: the config of one of the commands.
-_Command = Annotated[
-    Annotated[check.Config, tyro.conf.subcommand("check", description=check.__doc__)]
-    | Annotated[fit.Config, tyro.conf.subcommand("fit", description=fit.__doc__)]
-    | Annotated[evaluate.Config, tyro.conf.subcommand("eval", description=evaluate.__doc__)]
-    | Annotated[export.Config, tyro.conf.subcommand("export", description=export.__doc__)]
-    | Annotated[view.Config, tyro.conf.subcommand("view", description=view.__doc__)],
-    tyro.conf.FlagCreatePairsOff,
-]
+SUBCOMMANDS = {name: found for group in _GROUPS.values() for name, found in group.items()}
 
 
 def main(args: Sequence[str] | None = None) -> None:
-    """The command: `jaxpose`, or `python -m jaxpose`."""
-    config: Any = command.parse("jaxpose", _Command, __doc__, args, prog="jaxpose")  # pyright: ignore
-    name, module = _MODULES[type(config)]
+    """The command `jaxpose`, or `python -m jaxpose`.
 
-    code, shown = 0, None
+    Args:
+        args: the command line; None is that of this process.
+    """
+    args = sys.argv[1:] if args is None else list(args)
+    name = args[0] if args else ""
+    if name in ("--help", "-h", "--help-all"):
+        print(help_text())
+    elif name == "--version":
+        print(f"jaxpose {jaxpose.__version__}")
+    elif name in SUBCOMMANDS:
+        from jaxpose.experiments.command import start  # here, as --help and --version do without
 
-    def said() -> str:
-        nonlocal code, shown
-        progress = {"on_field": _tell} if module is fit else {}
-        result = module.run(config, **progress)
-        if module is view:
-            shown = result
-            return view.report(shown)
-        if module is check:
-            code = check.exit_code(result)
-        return json_text(result) if config.json else module.report(result)
-
-    command.guarded(f"jaxpose {name}", said)
-    if shown is not None:
-        view.wait(shown)
-    if code:
-        sys.exit(code)
+        start(SUBCOMMANDS[name].module, args[1:], prog=f"jaxpose {name}")
+    else:
+        near = difflib.get_close_matches(name, SUBCOMMANDS, 1)
+        hint = f"; did you mean {near[0]}?" if near else ""
+        sys.exit(f"jaxpose: expected one of {', '.join(SUBCOMMANDS)}, got {name or 'nothing'}{hint}")
 
 
-def _tell(field: str) -> None:
-    print(f"fitting {field}", file=sys.stderr)
+def help_text() -> str:
+    """What `jaxpose --help` prints.
+
+    Returns:
+        The subcommands, in groups.
+    """
+    lines = ["usage: jaxpose COMMAND [OPTIONS]", "", "Camera trajectories as continuous functions of time."]
+    for title, group in _GROUPS.items():
+        lines += ["", f"{title}:", *(f"  {name:<8} {found.summary}" for name, found in group.items())]
+    return "\n".join([*lines, "", "jaxpose COMMAND --help shows what a command takes; jaxpose --version"])
+
+
+if __name__ == "__main__":
+    main()

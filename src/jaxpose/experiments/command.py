@@ -1,85 +1,142 @@
-"""What every command does: options to a config, known errors to one line, bars, tables."""
+"""What every command does: options to a config, known errors to one line, progress, help."""
 
+import importlib
 import io
-import json
-import math
 import os
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import redirect_stderr
-from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, NoReturn
 
 import platformdirs
 import tyro
-from tqdm import tqdm
 
 from jaxpose.errors import DataError
+from jaxpose.experiments import progress
+from jaxpose.experiments.option_help import Groups, help_text
+from jaxpose.experiments.progress import OnUpdate, Update
+from jaxpose.files.atomic import json_text
 
-Config = TypeVar("Config")
+MODULE = "python -m jaxpose.experiments."
 
 
-def parse(
-    name: str,
-    config_type: Callable[..., Config],
-    description: str | None,
-    args: Sequence[str] | None = None,
-    *,
-    prog: str | None = None,
-) -> Config:
-    """The config that the command line asks for; exits with one line and code 1 if it asks for what is not.
+class Command(NamedTuple):
+    """A command: its options, what it does with them, and what it prints then."""
 
-    `--help` prints and exits with 0, as usual; there the command is called `prog`, by default that of an
-    experiment.
+    prog: str  # as it is typed
+    config: type
+    description: str | None
+    run: Callable[[Any, OnUpdate], Any]
+    report: Callable[[Any], str]
+    groups: Groups = {}  # noqa: RUF012 - never written to
+    hidden: Collection[str] = ()  # paths of fields that are no options
+
+    @property
+    def name(self) -> str:
+        """What its errors begin with."""
+        return self.prog.removeprefix(MODULE)
+
+
+def start(module: str, args: Sequence[str] | None = None, **given: Any) -> None:
+    """Load the module of a command and call its `main`; a line on stderr says so if that takes long.
+
+    Args:
+        module: where `main(args, **given)` is.
+        args: the command line; None is that of this process.
+        given: what else `main` takes.
     """
-    prog = prog or f"python -m jaxpose.experiments.{name}"
+    with progress.shown() as on_update:
+        on_update(Update("loading jaxpose", quiet=True))
+        main = importlib.import_module(module).main
+    main(args, **given)
+
+
+def execute(command: Command, args: Sequence[str] | None = None) -> Any:
+    """Parse the command line, run the command and print its report, or with `--json` its result.
+
+    Exits with one line on stderr and code 1 for what the user can mend.
+
+    Args:
+        command: the command.
+        args: the command line; None is that of this process.
+
+    Returns:
+        What the command's `run` returns.
+    """
+    config = parse(command, args)
+    result = guarded(command.name, lambda on_update: command.run(config, on_update))
+    print(json_text(result) if getattr(config, "json", False) else command.report(result), flush=True)
+    return result
+
+
+def parse(command: Command, args: Sequence[str] | None = None) -> Any:
+    """The config that the command line asks for.
+
+    Exits with one line and code 1 for options that mean nothing; `--help` and `--help-all` exit with 0.
+
+    Args:
+        command: the command.
+        args: the command line; None is that of this process.
+
+    Returns:
+        The config.
+    """
+    args = sys.argv[1:] if args is None else list(args)
+    for asked, everything in (("--help", False), ("-h", False), ("--help-all", True)):
+        if asked in args:
+            about = command.description or ""
+            what = command.prog, command.config, about, command.groups, command.hidden
+            print(help_text(*what, everything=everything))
+            sys.exit(0)
     complaint = io.StringIO()
     try:
         with redirect_stderr(complaint):
-            return tyro.cli(config_type, prog=prog, description=description, args=args)
+            return tyro.cli(
+                command.config, prog=command.prog, args=args, config=(tyro.conf.FlagCreatePairsOff,)
+            )
     except SystemExit as stop:
         if not stop.code:
             raise
-        sys.exit(f"{name}: {_one_line(complaint.getvalue())}")
+        fail(command.name, _one_line(complaint.getvalue()))
     except ValueError as error:  # a config that does not allow its values
-        sys.exit(f"{name}: {error}")
+        fail(command.name, str(error))
 
 
-def check_least(config: Any, **least: int | float) -> None:
-    """ValueError for an option (or an entry of one) below its least value, infinite or NaN; None is free."""
-    for name, smallest in least.items():
-        values = getattr(config, name)
-        for value in values if isinstance(values, tuple) else (values,):
-            if value is not None and not smallest <= value < math.inf:
-                option = name.replace("_", "-")
-                raise ValueError(f"--{option}: expected at least {smallest}, got {value}")
+def guarded(name: str, action: Callable[[OnUpdate], Any]) -> Any:
+    """Do what may fail, with its progress on stderr.
 
+    What the user can mend ends in one line on stderr and code 1.
 
-def check_resume(config: Any) -> None:
-    """ValueError for `resume` without the folder of the run to go on with."""
-    if config.resume and config.out is None and config.name is None:
-        raise ValueError("--resume: expected --out DIR or --name NAME with it")
+    Args:
+        name: what that line begins with.
+        action: what to do; it is given the function to call with each `Update`.
 
-
-def guarded(name: str, action: Callable[[], str]) -> None:
-    """Print what `action` returns; what the user can mend ends in one line on stderr and code 1."""
+    Returns:
+        What `action` returns.
+    """
     _keep_compiled()
     try:
-        print(action())
+        with progress.shown() as on_update:
+            return action(on_update)
     except (DataError, OSError) as error:
-        sys.exit(f"{name}: {' '.join(str(error).split())}")
+        fail(name, str(error))
     except KeyboardInterrupt:
-        sys.exit(f"{name}: interrupted")
+        fail(name, "interrupted")
+
+
+def fail(name: str, message: str) -> NoReturn:
+    """Exit with code 1 and one line on stderr."""
+    sys.exit(f"{name}: {' '.join(message.split())}")
 
 
 def _keep_compiled() -> None:
     """Keep what is compiled in the user's cache folder, so that the next start does not compile it again.
 
-    What the user has told JAX goes first: JAX_COMPILATION_CACHE_DIR names another folder, and
+    What the user has set for JAX goes first: JAX_COMPILATION_CACHE_DIR names another folder, and
     JAX_ENABLE_COMPILATION_CACHE=false keeps nothing.
     """
-    settings = {
+    settings: Mapping[str, Any] = {
         "jax_compilation_cache_dir": platformdirs.user_cache_dir("jaxpose"),
         "jax_persistent_cache_min_compile_time_secs": 0.0,
     }
@@ -91,59 +148,10 @@ def _keep_compiled() -> None:
             sys.modules["jax"].config.update(name, value)
 
 
-def step_bar() -> Callable[[str, int, int, dict[str, str]], None]:
-    """Draws a bar on stderr for each optimisation: call it with name, steps done, steps in all, and state."""
-    bar: tqdm | None = None
-    done = 0
-
-    def on_step(name: str, step: int, steps: int, state: dict[str, str]) -> None:
-        nonlocal bar, done
-        if bar is None:
-            bar, done = tqdm(total=steps, desc=name, unit="step", file=sys.stderr), 0
-        bar.set_postfix(state, refresh=False)
-        bar.update(step - done)
-        done = step
-        if step == steps:
-            bar.close()
-            bar = None
-
-    return on_step
-
-
-def resumes(folder: Path, stored: Path, settings: dict[str, Any], resume: bool) -> bool:
-    """Whether what a run folder holds is to be kept: on `resume`, if `stored` says that it is a run's.
-
-    DataError where it is that of a run with other settings (in JSON's types).
-    """
-    if not (resume and stored.exists()):
-        return False
-    before = json.loads(stored.read_text())
-    for name, value in settings.items():
-        if before.get(name) != value:
-            option = name.replace("_", "-")
-            raise DataError(f"{folder}: expected --{option} {before.get(name)}, as it began, got {value}")
-    return True
-
-
-def markdown_table(rows: Sequence[Sequence[str]]) -> str:
-    """Rows of cells as a table in Markdown, the first its head, columns as wide as they need to be."""
-    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
-    lines = [
-        "| " + " | ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) + " |"
-        for row in rows
-    ]
-    lines.insert(1, "|" + "|".join("-" * (width + 2) for width in widths) + "|")
-    return "\n".join(lines)
-
-
-def number(value: float | None, digits: int) -> str:
-    """A cell of a table; n/a where there is nothing to tell."""
-    return "n/a" if value is None else f"{value:.{digits}f}"
-
-
 def _one_line(boxed: str) -> str:
     """Tyro's message without its frame, its title and what it says about --help."""
     lines = [re.sub(r"[─│╭╮╰╯-]{3,}|[│╭╮╰╯]", " ", line).strip() for line in boxed.splitlines()]
     lines = [line for line in lines if line][1:]
     ends = [k for k, line in enumerate(lines) if line.startswith(("For full helptext", "Argument helptext"))]
-    return " ".join(" ".join(lines[: ends[0]] if ends else lines).split())
+    message = " ".join(" ".join(lines[: ends[0]] if ends else lines).split())
+    return re.sub(r"^Error parsing \w+: ", "", message)

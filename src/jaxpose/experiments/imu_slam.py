@@ -11,11 +11,12 @@ from typing import Annotated
 
 import tyro
 
-from jaxpose.experiments import command
-from jaxpose.experiments.slam import pipeline as slam_pipeline
+from jaxpose.experiments.command import MODULE
+from jaxpose.experiments.outcome import Outcome
+from jaxpose.experiments.progress import OnUpdate, silent
+from jaxpose.experiments.slam import pipeline
 from jaxpose.experiments.slam.options import Options
-from jaxpose.experiments.slam.report import progress_bar, report
-from jaxpose.slam.pipeline import SlamConfig
+from jaxpose.slam import SlamConfig
 
 
 @dataclass(frozen=True)
@@ -25,15 +26,25 @@ class Config(Options):
     slam: Annotated[SlamConfig, tyro.conf.arg(name="")] = SlamConfig(imu="combined")
 
 
-def run(config: Config, on_frame: slam_pipeline.OnFrame | None = None) -> slam_pipeline.Outcome:
-    """Track the recording that `config` names, and write its run folder; see `slam_run.run`."""
-    return slam_pipeline.run("imu_slam", config, on_frame)
+def run(config: Config, on_update: OnUpdate = silent) -> Outcome:
+    """Track a recording and write its run folder.
+
+    Args:
+        config: the recording and how to track it.
+        on_update: called with what the run is doing.
+
+    Returns:
+        The run folder, and its results; with `compare` those of each IMU mode under `modes`.
+
+    Raises:
+        DataError, OSError: for what cannot be read, tracked or written; then no folder is left behind.
+    """
+    return pipeline.run("imu_slam", config, on_update)
 
 
 def main(args: Sequence[str] | None = None) -> None:
-    """The command: `python -m jaxpose.experiments.imu_slam`."""
-    config = command.parse("imu_slam", Config, __doc__, args)
-    command.guarded("imu_slam", lambda: report(*run(config, progress_bar())))
+    """The command `python -m jaxpose.experiments.imu_slam`."""
+    pipeline.command(MODULE + "imu_slam", Config, __doc__, run, args)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""What trainings on photographs and on events share: the loop, its progress, checkpoints, the run folder."""
+"""What trainings on photographs and on events share: the loop, checkpoints, the run folder, results."""
 
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, Protocol, TypeVar, runtime_checkable
@@ -14,9 +14,11 @@ from jaxtyping import Float
 
 from jaxpose.errors import DataError
 from jaxpose.evaluation import trajectory_error
-from jaxpose.experiments import command
+from jaxpose.experiments.checks import own_folder
+from jaxpose.experiments.outcome import Outcome, cost
+from jaxpose.experiments.progress import OnUpdate, Update
 from jaxpose.fields import PoseField, set_progress
-from jaxpose.files import atomic, run_folder
+from jaxpose.files import atomic
 from jaxpose.files import checkpoint as checkpoint_file
 from jaxpose.nn import Activation
 from jaxpose.training.steps import State, Trainer
@@ -31,33 +33,11 @@ class NetConfig:
     """PoseNet's variants of tables 3 and 12; the defaults are the paper's main network."""
 
     octaves: int = 5  # of the time encoding; 0: time alone
-    layers: int = 8
-    width: int = 256
+    layers: int = 8  # of each network, the output layer among them
+    width: int = 256  # of the hidden layers
     coupled: bool = False  # one network with 7 outputs
-    activation: Activation = "relu"
+    activation: Activation = "relu"  # of the hidden layers
     window: tuple[float, float] | None = None  # coarse-to-fine on the time encoding, shares of the training
-
-
-class Progress(NamedTuple):
-    """Where a training is: after `step` of `steps`."""
-
-    label: str
-    steps: int
-    extent: float  # of the cameras' way [scene units]
-    step: int
-    loss: float
-    rotation_deg: float
-    translation: float  # [scene units]
-
-
-OnProgress = Callable[[Progress], None]
-
-
-class Outcome(NamedTuple):
-    """Where a run was written, and its results; those of a study under `runs`, by label."""
-
-    folder: Path
-    results: dict[str, Any]
 
 
 class Trained(NamedTuple):
@@ -74,8 +54,8 @@ class _Train(Protocol):
 
 
 @runtime_checkable
-class Setup(Protocol):
-    """What both experiments' setups have beside their own."""
+class Model(Protocol):
+    """What the models of both experiments have beside their own."""
 
     @property
     def trainer(self) -> Trainer: ...
@@ -84,29 +64,42 @@ class Setup(Protocol):
     def train(self) -> _Train: ...
 
 
-def initial_state(setup: Setup, seed: int) -> Trained:
+def initial_state(model: Model, seed: int) -> Trained:
     """A training at its start."""
-    history = np.full((setup.train.steps // CHUNK, len(COLUMNS)), np.nan)
-    return Trained(setup.trainer.start(jax.random.key(seed)), history)
+    history = np.full((model.train.steps // CHUNK, len(COLUMNS)), np.nan)
+    return Trained(model.trainer.start(jax.random.key(seed)), history)
 
 
 def train(
-    setup: Setup,
+    model: Model,
     trained: Trained,
     data: Any,
     errors: Callable[[Any], tuple[float, float]],
     checkpoint: Path,
-    on_progress: OnProgress | None,
+    on_update: OnUpdate,
     *,
     label: str,
-    extent: float,
+    describe: Callable[[float, float, float], Mapping[str, str]],
     between: Callable[[State], State] = lambda state: state,
 ) -> Trained:
     """Train to the end, from the checkpoint if there is one, and keep one as it goes.
 
-    `errors` gives rotation [deg] and translation errors of the pose field's parameters, `between` changes the
-    state after every chunk; `label` and `extent` are for the progress. DataError where the loss is no longer
-    a number.
+    Args:
+        model: what is trained, and its trainer.
+        trained: where it starts.
+        data: what the trainer takes.
+        errors: rotation [deg] and translation error of the pose field's parameters.
+        checkpoint: the file of it.
+        on_update: called after every chunk of steps.
+        label: of this run among others; empty: it is the only one.
+        describe: loss, rotation and translation error in words.
+        between: changes the state after every chunk.
+
+    Returns:
+        Where the training ended.
+
+    Raises:
+        DataError: where the loss is no longer a number.
     """
     if checkpoint.exists():
         trained = checkpoint_file.load(checkpoint, trained)
@@ -114,8 +107,10 @@ def train(
     done = int(state.step) // CHUNK
     before = history[done - 1, -1] if done else 0.0
     started = saved = time.perf_counter()
+    phase = " ".join(("training", label)).strip()
+    on_update(Update(f"compiling the {phase}"))
     for chunk in range(done, len(history)):
-        state, losses = setup.trainer.advance(state, data, CHUNK)
+        state, losses = model.trainer.advance(state, data, CHUNK)
         state = between(state)
         step, loss = (chunk + 1) * CHUNK, float(losses.mean())
         if not np.isfinite(loss):
@@ -126,18 +121,24 @@ def train(
         if now - saved > _SAVE_EVERY_S or chunk + 1 == len(history):
             checkpoint_file.save(checkpoint, Trained(state, history))
             saved = now
-        if on_progress is not None:
-            on_progress(Progress(label, setup.train.steps, extent, step, loss, *found))
+        on_update(Update(phase, step, model.train.steps, state=describe(loss, *found)))
     return Trained(state, history)
 
 
-def set_up_run_folder(folder: Path, config: Any, settings: dict[str, Any], *, resume: bool) -> None:
-    """Leave in the folder the config, and earlier results only if they are this run's and to be kept."""
+def set_up_run_folder(folder: Path, config: Any, settings: dict[str, Any]) -> None:
+    """Leave in the folder the config, and earlier results only if they are this run's and to be kept.
+
+    Args:
+        folder: the run folder.
+        config: of the run.
+        settings: what its results depend on.
+
+    Raises:
+        DataError: for the folder of another run, or of none.
+    """
     stored = folder / "settings.json"
     settings = json.loads(json.dumps(settings, default=_plain))
-    if not command.resumes(folder, stored, settings, resume):
-        for name in ("checkpoint.npz", "results.json"):
-            (folder / name).unlink(missing_ok=True)
+    if not own_folder(folder, stored, settings, config.resume, "checkpoint.npz", "results.json"):
         atomic.write_json(stored, settings)
     atomic.write_json(folder / "config.json", config)
 
@@ -157,14 +158,6 @@ def mean_errors(
     return found.rotation_deg, found.translation
 
 
-def progress_bar(describe: Callable[[Progress], dict[str, str]]) -> OnProgress:
-    """A callback that draws a bar on stderr for each training, with what `describe` says of it."""
-    bar = command.step_bar()
-    return lambda progress: bar(
-        progress.label or "training", progress.step, progress.steps, describe(progress)
-    )
-
-
 def results_of(
     experiment: str, config: Any, trained: Trained, started: float, **found: Any
 ) -> dict[str, Any]:
@@ -179,7 +172,7 @@ def results_of(
         "seconds_per_step": seconds / steps,
         "history_columns": COLUMNS,
         "history": trained.history,
-        **_cost(started),
+        **cost(started),
     }
 
 
@@ -193,7 +186,7 @@ def write_study(
         "seed": config.seed,
         "smoke": config.smoke,
         "runs": runs,
-        **_cost(started),
+        **cost(started),
     }
     atomic.write_json(folder / "config.json", config)
     atomic.write_text(folder / "table.md", table + "\n")
@@ -202,16 +195,16 @@ def write_study(
 
 
 P = TypeVar("P")
-S = TypeVar("S", bound=Setup)
+M = TypeVar("M", bound=Model)
 
 
 @dataclass(frozen=True)
-class Loaded(Generic[P, S]):
-    """A finished run: `setup.field.pose(state.pose, t)` is the camera's pose at any time [s], and
-    `setup.scene.query(state.scene, point, direction)` the density and colour of the scene."""
+class Loaded(Generic[P, M]):
+    """A finished run: `model.field.pose(state.pose, t)` is the camera's pose at any time [s], and
+    `model.scene.query(state.scene, point, direction)` the density and colour of the scene."""
 
     problem: P
-    setup: S
+    model: M
     state: State
 
 
@@ -219,29 +212,31 @@ def load_run(
     folder: Path | str,
     config_type: Callable[..., Any],
     load: Callable[[Any], P],
-    build: Callable[[Any, P], S],
-) -> Loaded[P, S]:
+    build: Callable[[Any, P], M],
+) -> Loaded[P, M]:
     """The scene and the trajectory that a run has left in its folder; its data are read again.
 
-    DataError or OSError for a folder that holds no run.
+    Args:
+        folder: the run folder.
+        config_type: the config of its experiment.
+        load: reads the data that a config names.
+        build: the model for them.
+
+    Returns:
+        Data, model and its trained state.
+
+    Raises:
+        DataError, OSError: for a folder that holds no run.
     """
     settings = json.loads((Path(folder) / "settings.json").read_text())
     net, window = settings["net"], settings["net"]["window"]
     net = NetConfig(**net | {"window": window and tuple(window)})
     config = config_type(**settings | {"data": Path(settings["data"]), "net": net})
     problem = load(config)
-    setup = build(config, problem)
-    state = checkpoint_file.load(Path(folder) / "checkpoint.npz", initial_state(setup, config.seed)).state
+    model = build(config, problem)
+    state = checkpoint_file.load(Path(folder) / "checkpoint.npz", initial_state(model, config.seed)).state
     scene = set_progress(state.scene, jnp.ones(()))
-    return Loaded(problem, setup, state._replace(scene=scene))
-
-
-def _cost(started: float) -> dict[str, Any]:
-    return {
-        "versions": run_folder.versions(),
-        "wall_s": time.perf_counter() - started,
-        "peak_rss_bytes": run_folder.peak_rss_bytes(),
-    }
+    return Loaded(problem, model, state._replace(scene=scene))
 
 
 def _plain(value: Any) -> Any:

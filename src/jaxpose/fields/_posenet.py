@@ -20,8 +20,8 @@ class PoseNetConfig:
 
     span: tuple[float, float] = (-1.0, 1.0)  # first and last time [s], mapped to -1 and 1
     octaves: int = 5  # of the time encoding; 0 = time alone (the "linear encoder")
-    layers: int = 8
-    width: int = 256
+    layers: int = 8  # of each network, the output layer among them
+    width: int = 256  # of the hidden layers
     activation: nn.Activation = "relu"  # "softplus" as soon as a time derivative is used
     # Of the Xavier draw of hidden layers; the paper's is 1. Softplus, whose slope at 0 is 1/2, fits in a
     # quarter of the steps with 2, but what it does between the data is rougher.

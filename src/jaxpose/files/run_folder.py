@@ -13,7 +13,16 @@ import jaxpose
 
 
 def folder_path(experiment: str, *, name: str | None = None, out: Path | str | None = None) -> Path:
-    """The folder of a run: `out` if given, else `outputs/<experiment>/<name or timestamp>`; not made yet."""
+    """The folder of a run, which is not made yet.
+
+    Args:
+        experiment: what makes the run.
+        name: of its folder within `outputs/<experiment>`; None: a timestamp.
+        out: exactly this folder instead.
+
+    Returns:
+        Its path.
+    """
     timestamp = f"{datetime.now():%Y-%m-%d_%H-%M-%S.%f}"
     return Path(out) if out is not None else Path("outputs") / experiment / (name or timestamp)
 
@@ -23,7 +32,16 @@ def opened(folder: Path) -> Iterator[Path]:
     """Make a run folder, and take it away again if what is done in it fails before anything is written.
 
     A folder that exists is written over or resumed. Only folders that were made here are taken away, and only
-    empty ones. OSError at once where nothing can be written.
+    empty ones.
+
+    Args:
+        folder: the run folder.
+
+    Returns:
+        The same, for the length of the `with` block.
+
+    Raises:
+        OSError: at once where nothing can be written.
     """
     made = [path for path in (folder, *folder.parents) if not path.exists()]
     folder.mkdir(parents=True, exist_ok=True)

@@ -15,7 +15,7 @@ from jaxpose.files.atomic import atomic
 from jaxpose.plots.slam import _STYLE, DPI, ESTIMATE, LOST
 
 _TRUTH, _START, _ESTIMATE = "#ffffff", "#f5c518", "#35c8f5"  # over a photograph, not over paper
-_FIELDS = {"posenet": ESTIMATE, "table": "#e0902f", "spline_reset": "#b5322d", "bspline": "#5a9e5a"}
+_FIELDS = {"posenet": ESTIMATE, "per_frame": "#e0902f", "spline_reset": "#b5322d", "bspline": "#5a9e5a"}
 _FLOOR = 1e-3  # [px] of a logarithmic axis
 
 

@@ -41,9 +41,9 @@ def _check(config, name: str, *, at_least: dict[str, int] | None = None, positiv
 class SampleConfig:
     """Samples along a ray: evenly up to the measured surface, denser through it, a few behind."""
 
-    front: int = 6
-    surface: int = 16
-    behind: int = 2
+    front: int = 6  # before the surface
+    surface: int = 16  # through it
+    behind: int = 2  # behind it
     band: float = 0.12  # [m] to either side of the measured depth that counts as the surface
     width: float = 0.015  # [m] thickness of a rendered surface (`render.sdf_weights`)
 
@@ -59,14 +59,15 @@ class TrackConfig:
     iteration. `gauss_newton` registers the frame to the map's surface by second-order steps on its pose.
     """
 
+    # gauss_newton registers a frame to the surface; gradient is the paper's, through the renderer.
     method: Literal["gauss_newton", "gradient"] = "gauss_newton"
-    pixels: int = 5000  # 200 to 1000 for `gradient`, which draws new ones in each iteration
+    pixels: int = 5000  # of a frame; 200 to 1000 for `gradient`, which draws new ones in each iteration
     edge: int = 8  # [px] border left out
-    iterations: int = 25  # at most; 150 for `gradient`
+    iterations: int = 25  # steps at most; 150 for `gradient`
     patience: int = 30  # of `gradient`: iterations without a lower loss after which to stop
     learning_rate: float = 1e-3  # of `gradient`: Adam, of TransNet [per translation_scale]
-    rotation_rate: float = 2e-4  # and of RotsNet
-    decay: float = 0.1  # of both rates over the iterations
+    rotation_rate: float = 2e-4  # of `gradient`: Adam, of RotsNet
+    decay: float = 0.1  # of `gradient`: of both rates over the iterations
     field_steps: int = 60  # of `gradient`: Adam steps of fitting the field to the predicted motion
     colour_weight: float = 0.1  # of the colour residual against the depth residual, both in sigmas
     dof_weight: float = 0.1  # of L_dof, in the frame intrinsic under `gradient`
@@ -82,14 +83,15 @@ class TrackConfig:
 class MapConfig:
     """How the scene is mapped; all but the first is of the method `gradient`, the paper's way."""
 
+    # fused integrates depth into signed distances; gradient is the paper's, through the renderer.
     method: Literal["fused", "gradient"] = "fused"
     pixels: int = 1000  # per iteration, shared by the frames of the window
-    edge: int = 4
+    edge: int = 4  # [px] border left out
     window: int = 5  # frames: the current one, the last keyframe, and keyframes that overlap
-    iterations: int = 20
-    first_iterations: int = 200
-    learning_rate: float = 2e-3  # of Adam
-    first_rate: float = 5e-3
+    iterations: int = 20  # of Adam in a mapping step
+    first_iterations: int = 200  # of Adam at the first frame
+    learning_rate: float = 2e-3  # of Adam after that
+    first_rate: float = 5e-3  # of Adam at the first frame
     sample: SampleConfig = SampleConfig(front=8, surface=14, behind=0)
 
     def __post_init__(self):
@@ -110,7 +112,7 @@ class RecoveryConfig:
     recognised_valid: float = 0.7  # after a loss, of a camera that could be anywhere: share explained,
     recognised_loss: float = 1.1  # and loss against the usual
     found_valid: float = 0.5  # the same of a camera that must be near
-    found_loss: float = 1.3
+    found_loss: float = 1.3  # and loss against the usual
     lost_loss: float = 2.0  # against the usual: a registration that is worse has failed
     reckoned: float = 0.3  # [m, rad] a pose from the IMU alone is good enough to go on from
     weak: float = 0.02  # [m, rad] a pose known less well is weak
@@ -133,15 +135,17 @@ class RecoveryConfig:
 class SlamConfig:
     """Settings of a run; every random choice follows from `seed`."""
 
+    # What of the IMU is used: gyroscope (loose, tight), and accelerometer too (accelerometer, combined).
     imu: ImuMode = "none"
+    # What the output of the field is relative to; all but anchored, which is ours, are the paper's (table 9).
     frame: FrameName = "anchored"
-    seed: int = 0
+    seed: int = 0  # of the network's start, the pixels drawn, the noise of a simulated IMU
     field: PoseNetConfig = PoseNetConfig(layers=4, width=128, activation="softplus")
     track: TrackConfig = TrackConfig()
     map: MapConfig = MapConfig()
     recovery: RecoveryConfig = RecoveryConfig()
     map_every_s: float = 0.15  # [s] between mapping steps
-    voxel: float | None = None  # [m]; None: from the size of the room
+    voxel: float | None = None  # [m] size of the map's cells; None: from the size of the room
     hold_out: int = 0  # every n-th frame is tracked but never mapped, to measure the map on; 0: none
     keyframe_overlap: float = 0.9  # a frame that shares less with every keyframe becomes one
     imu_noise: ImuNoise = ADIS16448

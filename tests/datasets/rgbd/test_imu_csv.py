@@ -13,7 +13,7 @@ from jaxpose.datasets.rgbd.imu_csv import imu_notes, read_imu, read_mounting, wi
 from jaxpose.datasets.types import Recording
 from jaxpose.errors import DataError
 from jaxpose.experiments.imu_slam import Config, main
-from jaxpose.experiments.slam.options import load
+from jaxpose.experiments.slam.source import load
 from jaxpose.geometry.camera import Camera
 from jaxpose.slam.initial_pose import first_pose
 

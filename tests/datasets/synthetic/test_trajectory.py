@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from jaxpose.datasets.synthetic import RoomConfig, room, trajectory
 from jaxpose.errors import DataError
 from jaxpose.experiments.imu_slam import Config
-from jaxpose.experiments.slam.options import load
+from jaxpose.experiments.slam.source import load
 from jaxpose.geometry import se3
 from jaxpose.imu.simulation import simulate
 

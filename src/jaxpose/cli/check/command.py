@@ -1,4 +1,4 @@
-"""What a set of data, and what is wrong with it: timestamps, poses, camera, depth, IMU, and how they agree.
+"""What a set of data is, and its faults: timestamps, poses, camera, depth, IMU, and how they agree.
 
 DATA is a folder of an RGB-D recording (7-Scenes, TUM, Replica, ScanNet, EuRoC, plain), of photographs with
 poses (Blender, nerfstudio, LLFF), of an IMU with ground truth (EuRoC), or of events (DAVIS text, EventNeRF,
@@ -6,6 +6,8 @@ npz, DSEC's HDF5); a trajectory file (TUM, KITTI, EuRoC, 4x4), or a folder of su
 by the files. Ends with 0 if no fault is found, with 2 for warnings, and with 1 for data that cannot be used.
 """
 
+import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -14,6 +16,8 @@ import tyro
 
 from jaxpose.cli.check.findings import Checked, Fact, Finding
 from jaxpose.errors import DataError
+from jaxpose.experiments.command import Command, execute
+from jaxpose.experiments.progress import OnUpdate, Update, silent
 
 _KNOWN = (
     "an RGB-D recording (7-Scenes, TUM, Replica, ScanNet, EuRoC, or color/ and depth/ with intrinsics), "
@@ -40,8 +44,20 @@ class Result(NamedTuple):
     notes: tuple[str, ...]  # what loaders skipped or assumed, and what could not be tested
 
 
-def run(config: Config) -> Result:
-    """Find the format of the data and test them; DataError or OSError for what has no format known here."""
+def run(config: Config, on_update: OnUpdate = silent) -> Result:
+    """Find the format of the data and test them.
+
+    Args:
+        config: the data.
+        on_update: called with what is being done.
+
+    Returns:
+        What they are, and the outcome of every test.
+
+    Raises:
+        DataError, OSError: for what cannot be used.
+    """
+    on_update(Update(f"checking {config.data}", quiet=True))
     path = config.data
     if path.is_file() and path.suffix not in (".json", ".npz", ".h5", ".hdf5"):
         from jaxpose.cli.check.trajectory import check_trajectory
@@ -52,6 +68,17 @@ def run(config: Config) -> Result:
         raise DataError(f"{path}: expected {_KNOWN}, got nothing")
     form, checked = _folder(path)
     return Result(path, form, *checked)
+
+
+def main(args: Sequence[str] | None = None, prog: str = "jaxpose check") -> None:
+    """The command `jaxpose check`.
+
+    Args:
+        args: the command line; None is that of this process.
+        prog: the command as it is typed.
+    """
+    if code := exit_code(execute(Command(prog, Config, __doc__, run, report), args)):
+        sys.exit(code)
 
 
 def report(result: Result) -> str:

@@ -1,14 +1,14 @@
-"""Which pose field carries a motion: several fitted to stamped poses, and what is left of each.
+"""Which pose field carries a motion: several fitted to timestamped poses, and the error of each.
 
-TRAJECTORY is a file of stamped poses (TUM, KITTI, EuRoC or TUM-VI csv, 4x4 lists: found by its content) or a
-run folder. Every tenth pose is held out. With --imu the fields' own derivatives, which have seen poses only,
-are compared with a gyroscope and an accelerometer.
+TRAJECTORY is a file of timestamped poses (TUM, KITTI, EuRoC or TUM-VI csv, 4x4 lists: found by its content)
+or a run folder. Every tenth pose is held out. With --imu the fields' own derivatives, which have seen poses
+only, are compared with a gyroscope and an accelerometer.
 """
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import tyro
@@ -16,7 +16,10 @@ import tyro
 from jaxpose.cli.fit.types import FEWEST, Fitted, Sensor
 from jaxpose.cli.source import read_source
 from jaxpose.errors import DataError
-from jaxpose.experiments.command import check_least, markdown_table
+from jaxpose.experiments.checks import check_apart, check_least, check_positive
+from jaxpose.experiments.command import Command, execute
+from jaxpose.experiments.outcome import markdown_table
+from jaxpose.experiments.progress import OnUpdate, Update, silent
 from jaxpose.files.trajectories import Trajectory
 from jaxpose.geometry.rigid import Similarity
 
@@ -27,28 +30,29 @@ _SLOW = 3.0  # times the best field's error
 class Config:
     """Settings of the comparison; the trajectory and these are all that the numbers depend on."""
 
-    trajectory: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="TRAJECTORY")]  # or a run folder
+    trajectory: Annotated[
+        Path, tyro.conf.Positional, tyro.conf.arg(metavar="TRAJECTORY")
+    ]  # file of timestamped poses, or a run folder
     # Folder in the EuRoC layout whose mav0/imu0 was read by the same clock, in the same body, as the poses.
     imu: Path | None = None
-    rate_hz: float | None = None  # of the poses of a format without timestamps
+    recorded_hz: float | None = None  # [Hz] rate of the poses where the file has no timestamps
     posenet_octaves: tuple[int, ...] = (5, 8)  # PoseNets to fit, by the octaves of their time encoding
-    posenet_layers: int = 8
-    posenet_width: int = 256
+    posenet_layers: int = 8  # of PoseNets
+    posenet_width: int = 256  # of the layers of PoseNets
     bspline_hz: tuple[float, ...] = (2.0, 5.0, 10.0, 20.0)  # B-splines to fit, by their knots a second
     steps: int = 1000  # of Adam, for each field
     seed: int = 0  # of the networks' start
-    out: Path | None = None  # write the field that fits best: npz that jaxpose/numpy_field.py reads
+    out: Path | None = (
+        None  # write the field that fits best: npz that `jaxpose/fields/numpy_evaluator.py` reads
+    )
     json: bool = False  # print the numbers as JSON and nothing else
 
     def __post_init__(self):
         if not self.posenet_octaves and not self.bspline_hz:
             raise ValueError("--bspline-hz: expected a field to fit, PoseNet or B-spline, got none")
         check_least(self, posenet_octaves=0, posenet_layers=1, posenet_width=1, steps=1)
-        for option in ("bspline_hz", "rate_hz"):
-            values = getattr(self, option)
-            for value in values if isinstance(values, tuple) else (values,):
-                if value is not None and not 0 < value < np.inf:
-                    raise ValueError(f"--{option.replace('_', '-')}: expected positive numbers, got {value}")
+        check_positive(self, "bspline_hz", "recorded_hz")
+        check_apart("--out", self.out, self.trajectory)
 
 
 class Result(NamedTuple):
@@ -67,13 +71,21 @@ class Result(NamedTuple):
     notes: tuple[str, ...]
 
 
-def run(config: Config, on_field: Callable[[str], None] | None = None) -> Result:
-    """Fit every field that the config names; `on_field` is told the name of each before its turn.
+def run(config: Config, on_update: OnUpdate = silent) -> Result:
+    """Fit every field that the config names, and write the best one if it says so.
 
-    Raises DataError or OSError for what cannot be used.
+    Args:
+        config: the trajectory, and the fields to fit.
+        on_update: called with what is being done.
+
+    Returns:
+        The fields, and how they were measured.
+
+    Raises:
+        DataError, OSError: for what cannot be used.
     """
+    on_update(Update("loading JAX", quiet=True))
     from jaxpose.cli.fit import candidates as fit_candidates
-    from jaxpose.fields.serialization import write_field
 
     source, trajectory = _trajectory(config)
     imu, sensor, notes = (None, None, ())
@@ -82,24 +94,14 @@ def run(config: Config, on_field: Callable[[str], None] | None = None) -> Result
     span_s = float(trajectory.t[-1] - trajectory.t[0])
     rate_hz = 1 / float(np.median(np.diff(trajectory.t)))
     held = np.arange(len(trajectory.t)) % 10 == 5
-    candidates = [
-        fit_candidates.posenet(span_s, octaves, config.posenet_layers, config.posenet_width, config.seed)
-        for octaves in config.posenet_octaves
-    ]
-    for knots_hz in config.bspline_hz:
-        if knots_hz <= rate_hz / 2:
-            candidates.append(fit_candidates.bspline(span_s, knots_hz))
-        else:
-            notes += (
-                f"no B-spline of {knots_hz:g} knots/s: fewer than two poses for each ({rate_hz:.3g} Hz)",
-            )
-    if not candidates:
+    chosen, sparse = _candidates(config, span_s, rate_hz)
+    notes += sparse
+    if not chosen:
         raise DataError(f"{source}: expected more poses for these B-splines, got {rate_hz:.3g} Hz")
     around = fit_candidates.frame(trajectory)
     fitted, factors = [], []
-    for candidate in candidates:
-        if on_field is not None:
-            on_field(candidate.name)
+    for number, candidate in enumerate(chosen):
+        on_update(Update(f"fitting {candidate.name}, {number + 1} of {len(chosen)} fields"))
         field, factor = fit_candidates.fit_field(candidate, trajectory, held, around, imu, config.steps)
         fitted.append(field)
         factors.append(factor)
@@ -110,10 +112,7 @@ def run(config: Config, on_field: Callable[[str], None] | None = None) -> Result
     bandwidth_hz = fit_candidates.bandwidth_hz(trajectory)
     slow = [f.highest_hz < bandwidth_hz and x > _SLOW * off.min() for f, x in zip(fitted, off, strict=True)]
     if config.out is not None:
-        config.out.parent.mkdir(parents=True, exist_ok=True)
-        moved = Similarity(around.scale, np.eye(3), around.middle)
-        span = (float(trajectory.t[0]), float(trajectory.t[-1]))
-        write_field(config.out, span, [factors[best]], alignment=moved)
+        _write(config.out, trajectory, factors[best], Similarity(around.scale, np.eye(3), around.middle))
         notes += (f"{fitted[best].name} written to {config.out}, seconds as in {config.trajectory.name}",)
     return Result(
         source,
@@ -128,6 +127,16 @@ def run(config: Config, on_field: Callable[[str], None] | None = None) -> Result
         tuple(f.name for f, is_slow in zip(fitted, slow, strict=True) if is_slow),
         notes,
     )
+
+
+def main(args: Sequence[str] | None = None, prog: str = "jaxpose fit") -> None:
+    """The command `jaxpose fit`.
+
+    Args:
+        args: the command line; None is that of this process.
+        prog: the command as it is typed.
+    """
+    execute(Command(prog, Config, __doc__, run, report), args)
 
 
 def report(result: Result) -> str:
@@ -186,18 +195,38 @@ def report(result: Result) -> str:
     return f"{markdown_table(rows)}\n\n{told}"
 
 
+def _candidates(config: Config, span_s: float, rate_hz: float) -> tuple[list, tuple[str, ...]]:
+    """The fields to fit, and a note for each that has too many knots for these poses."""
+    from jaxpose.cli.fit import candidates
+
+    net = config.posenet_layers, config.posenet_width, config.seed
+    chosen = [candidates.posenet(span_s, octaves, *net) for octaves in config.posenet_octaves]
+    dense = [hz for hz in config.bspline_hz if hz > rate_hz / 2]
+    chosen += [candidates.bspline(span_s, hz) for hz in config.bspline_hz if hz not in dense]
+    why = f"fewer than two poses for each ({rate_hz:.3g} Hz)"
+    return chosen, tuple(f"no B-spline of {hz:g} knots/s: {why}" for hz in dense)
+
+
+def _write(out: Path, trajectory: Trajectory, factor: Any, moved: Similarity) -> None:
+    """A fitted field as a file."""
+    from jaxpose.fields.serialization import write_field
+
+    out.parent.mkdir(parents=True, exist_ok=True)
+    write_field(out, (float(trajectory.t[0]), float(trajectory.t[-1])), [factor], alignment=moved)
+
+
 def _trajectory(config: Config) -> tuple[str, Trajectory]:
     """The poses with their timestamps, and what they are in words."""
     source = read_source(config.trajectory)
     trajectory = source.trajectory
     if not source.stamped:
-        if config.rate_hz is None:
+        if config.recorded_hz is None:
             raise DataError(
-                f"{source.path}: expected --rate-hz, as a {source.what} has no timestamps, got none"
+                f"{source.path}: expected --recorded-hz, as a {source.what} has no timestamps, got none"
             )
-        trajectory = trajectory._replace(t=trajectory.t / config.rate_hz)
-    elif config.rate_hz is not None:
-        raise DataError(f"{source.path}: expected no --rate-hz, as a {source.what} has timestamps")
+        trajectory = trajectory._replace(t=trajectory.t / config.recorded_hz)
+    elif config.recorded_hz is not None:
+        raise DataError(f"{source.path}: expected no --recorded-hz, as a {source.what} has timestamps")
     if len(trajectory.t) < FEWEST:
         raise DataError(f"{source.path}: expected at least {FEWEST} poses to fit, got {len(trajectory.t)}")
     return str(source), trajectory

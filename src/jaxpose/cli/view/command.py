@@ -1,6 +1,4 @@
-"""Look at a run in the browser: its path and ground truth, cameras with their pictures, map.
-
-Renders over time.
+"""Show a run in the browser: path and ground truth, cameras with their images, map, renders over time.
 
 RUN is a run folder, or a trajectory file. A slider moves a camera along the run's continuous trajectory and
 shows what the run's map or radiance field shows from there. Nothing is loaded from the network. --save writes
@@ -9,7 +7,7 @@ the scene as one HTML file, the camera on its way in it, which opens in any brow
 
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -18,23 +16,28 @@ import tyro
 
 from jaxpose.cli.view.scene import read_scene
 from jaxpose.errors import DataError
+from jaxpose.experiments.checks import check_apart, check_least
+from jaxpose.experiments.command import Command, execute
+from jaxpose.experiments.progress import OnUpdate, Update, silent
 
 
 @dataclass(frozen=True)
 class Config:
     """What to show, and where."""
 
-    run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]  # folder, or trajectory file
+    run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]  # run folder, or trajectory file
     port: int = 8080  # of the page; the next free one if it is taken
-    host: str = "127.0.0.1"  # who may see it: this machine alone; 0.0.0.0: everyone who reaches it
+    host: str = (
+        "127.0.0.1"  # address to listen at: only this machine sees it; 0.0.0.0: any machine that reaches it
+    )
     frustums: int = 30  # so many frames, evenly over the run, are shown as cameras with their pictures
     save: Path | None = None  # HTML file to write instead
 
     def __post_init__(self):
         if not 0 <= self.port < 65536:
             raise ValueError(f"--port: expected 0 (any) to 65535, got {self.port}")
-        if self.frustums < 0:
-            raise ValueError(f"--frustums: expected 0 or more, got {self.frustums}")
+        check_least(self, frustums=0)
+        check_apart("--save", self.save, self.run)
         if self.save is not None and self.save.suffix != ".html":
             raise ValueError(f"--save: expected a name that ends in .html, got {self.save}")
 
@@ -49,23 +52,43 @@ class Shown(NamedTuple):
     close: Callable[[], None]
 
 
-def run(config: Config) -> Shown:
+def run(config: Config, on_update: OnUpdate = silent) -> Shown:
     """Show the run until `close()` is called, or write it to a file.
 
-    Raises DataError or OSError for what cannot be used.
+    Args:
+        config: what to show, and where.
+        on_update: called with what is being done.
+
+    Returns:
+        Where it is to be seen.
+
+    Raises:
+        DataError, OSError: for what cannot be used.
     """
+    on_update(Update(f"reading {config.run}", quiet=True))
     try:
         from jaxpose.cli.view import page as view_page
     except ImportError:
         raise DataError('expected viser, got none: pip install "jaxpose[viewer]"') from None
-    scene = read_scene(config.run, config.frustums)
+    scene = read_scene(config.run, config.frustums, on_update)
     if config.save is not None:
-        view_page.save(scene, config.save)
+        view_page.save(scene, config.save, on_update)
         return Shown(scene.name, None, config.save, scene.notes, lambda: None)
+    on_update(Update("opening the page", quiet=True))
     port, close = view_page.serve(scene, config.host, config.port)
     notes = () if config.port in (0, port) else (f"port {config.port} is taken",)
     host = "localhost" if config.host in ("127.0.0.1", "0.0.0.0") else config.host
     return Shown(scene.name, f"http://{host}:{port}", None, (*notes, *scene.notes), close)
+
+
+def main(args: Sequence[str] | None = None, prog: str = "jaxpose view") -> None:
+    """The command `jaxpose view`.
+
+    Args:
+        args: the command line; None is that of this process.
+        prog: the command as it is typed.
+    """
+    wait(execute(Command(prog, Config, __doc__, run, report), args))
 
 
 def report(shown: Shown) -> str:

@@ -1,4 +1,4 @@
-"""The page of a run: what `view_scene` found, drawn with viser, with a slider for time, or in a file."""
+"""The page of a run: what `scene` found, drawn with viser, with a slider for time, or in a file."""
 
 import io
 import queue
@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxpose.cli.view.types import WIDTH, Picture, Scene
 from jaxpose.errors import DataError
+from jaxpose.experiments.progress import OnUpdate, Update, silent
 from jaxpose.files.atomic import atomic
 from jaxpose.geometry.camera import angle_of_view
 
@@ -40,8 +41,8 @@ def serve(scene: Scene, host: str, port: int) -> tuple[int, Callable[[], None]]:
     return server.get_port(), close
 
 
-def save(scene: Scene, file: Path) -> None:
-    """Write the scene as one HTML file that plays the camera's way, as fast as it was."""
+def save(scene: Scene, file: Path, on_update: OnUpdate = silent) -> None:
+    """Write the scene as one HTML file that plays the camera's motion, as fast as it was."""
     server = _server("127.0.0.1", 0)
     try:
         camera = _draw(server, scene, None)
@@ -49,11 +50,13 @@ def save(scene: Scene, file: Path) -> None:
         last = float(scene.t[-1])
         count = min(_SAVED_FRAMES, max(2, round(30 * last)))
         for k, t in enumerate(np.linspace(0, last, count)):
+            on_update(Update("rendering", k, count, "frames"))
             if k:
                 recording.insert_sleep(last / (count - 1))
             _move(camera, scene, float(t))
             if scene.render is not None:
                 camera.image = scene.render(float(t), WIDTH)
+        on_update(Update(f"writing {file}"))
         page = recording.as_html()
     finally:
         _stop(server)

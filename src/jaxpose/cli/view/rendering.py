@@ -15,7 +15,8 @@ from jaxpose.cli.view.types import Picture, Poses, Render
 from jaxpose.errors import DataError
 from jaxpose.experiments.event_nerf import pipeline as event_nerf
 from jaxpose.experiments.noisy_nerf import pipeline as noisy_nerf
-from jaxpose.experiments.slam import map_files
+from jaxpose.experiments.slam.map_file import read_map
+from jaxpose.experiments.slam.map_rendering import every, viewer
 from jaxpose.geometry.camera import Camera, scale
 from jaxpose.slam.map.texture import textured
 from jaxpose.training import photometric
@@ -24,12 +25,12 @@ from jaxpose.training.photometric import TrainConfig
 
 def of_map(file: Path, camera: Camera, poses: Poses) -> Render:
     """The map of a SLAM run from where `poses` is at a time, light grey where it has no surface."""
-    saved = map_files.read_map(file)
-    look = map_files.viewer(textured(scenes.grid(saved.grid), saved.grid), saved.grid, camera)
+    saved = read_map(file)
+    look = viewer(textured(scenes.grid(saved.grid), saved.grid), saved.grid, camera)
     params = (jnp.asarray(saved.values), jax.tree.map(jnp.asarray, saved.texture))
 
     def render(t: float, width: int) -> Picture:
-        return _picture(look(params, poses(np.array([t]))[0], map_files.every(camera, width))[0])
+        return _picture(look(params, poses(np.array([t]))[0], every(camera, width))[0])
 
     return render
 
@@ -43,17 +44,17 @@ def of_radiance(folder: Path, first: float) -> Render:
         camera, depths, background = problem.recording.camera, problem.depths, problem.background
     elif experiment == "noisy_nerf":
         loaded = noisy_nerf.load_run(folder)
-        camera, depths, background = loaded.problem.train.camera, loaded.setup.depths, None
+        camera, depths, background = loaded.problem.train.camera, loaded.model.depths, None
     else:
         raise DataError(f"{folder}: expected a run of noisy_nerf or event_nerf, got {experiment}")
-    setup, state = loaded.setup, loaded.state
-    config = TrainConfig(steps=1, rays=1, samples=setup.train.samples, chunk=64)
-    pose = jax.jit(partial(setup.field.pose, state.pose))
+    model, state = loaded.model, loaded.state
+    config = TrainConfig(steps=1, rays=1, samples=model.train.samples, chunk=64)
+    pose = jax.jit(partial(model.field.pose, state.pose))
 
     @cache
     def image(width: int) -> Callable:
         small = scale(camera, min(1.0, width / camera.width))
-        return photometric.viewer(setup.scene, small, depths, config, background=background).image
+        return photometric.viewer(model.scene, small, depths, config, background=background).image
 
     def render(t: float, width: int) -> Picture:
         return _picture(image(width)(state.scene, pose(jnp.float32(first + t)))[0])

@@ -10,6 +10,7 @@ from jaxpose.cli.source import FIELD, Source, images_on_disk, read_field, read_s
 from jaxpose.cli.view.types import WIDTH, Picture, Poses, Render, Scene, Shot
 from jaxpose.errors import DataError
 from jaxpose.evaluation import trajectory_error
+from jaxpose.experiments.progress import OnUpdate, Update, silent
 from jaxpose.files import trajectories
 
 if TYPE_CHECKING:
@@ -20,7 +21,7 @@ _PATH_STEPS = 4000  # pieces of the drawn path at most
 _UPRIGHT = 0.9  # cosine: cameras that stand so upright on an axis of the world say that it points up
 
 
-def read_scene(path: Path, frustums: int) -> Scene:
+def read_scene(path: Path, frustums: int, on_update: OnUpdate = silent) -> Scene:
     """Read a run folder or a trajectory file, `frustums` of its frames with their pictures.
 
     What is not there is not shown, and a note says so. DataError or OSError for what is no trajectory, and
@@ -37,7 +38,7 @@ def read_scene(path: Path, frustums: int) -> Scene:
         surface = next((path / name for name in ("mesh.ply", "points.ply") if (path / name).is_file()), None)
     steps = np.linspace(0, t[-1], min(_PATH_STEPS, 8 * len(t)))
     continuous = source.is_run and (path / FIELD).is_file()
-    shots, shown = _shots(source, frustums, images, render)
+    shots, shown = _shots(source, frustums, images, render, on_update)
     return Scene(
         name=str(source),
         camera=camera,
@@ -71,7 +72,7 @@ def _poses(source: Source) -> tuple[Poses, tuple[str, ...]]:
     if source.is_run and (source.path / FIELD).is_file():
         field = read_field(source)
         return lambda s: field(t[0] + s), ()
-    note = f"no {FIELD}: between its frames the camera's way is not known, it stands at the nearest"
+    note = f"no {FIELD}: between its frames the camera's motion is not known, it stands at the nearest"
     return lambda s: T[trajectories.nearest(t[0] + s, t)], (note,)
 
 
@@ -113,7 +114,7 @@ def _reference(source: Source) -> tuple[Float[np.ndarray, "k 3"] | None, tuple[s
 
 
 def _keyframes(source: Source) -> Float[np.ndarray, "j 3"]:
-    from jaxpose.experiments.slam.map_files import read_map
+    from jaxpose.experiments.slam.map_file import read_map
 
     file = source.path / "map.npz"
     if not (source.is_run and file.is_file()):
@@ -142,13 +143,14 @@ def _render(source: Source, poses: Poses, camera: "Camera") -> tuple[Render | No
 
 
 def _shots(
-    source: Source, most: int, images: tuple[Path, ...], render: Render | None
+    source: Source, most: int, images: tuple[Path, ...], render: Render | None, on_update: OnUpdate
 ) -> tuple[tuple[Shot, ...], tuple[str, ...]]:
     """Some of the frames, evenly, the first and the last among them."""
     t, T = source.trajectory
     rows = np.unique(np.linspace(0, len(t) - 1, min(most, len(t))).round().astype(int)) if most else []
     shots = []
-    for row in rows:
+    for number, row in enumerate(rows):
+        on_update(Update("images of the frustums", number, len(rows), "frames", quiet=bool(images)))
         s = float(t[row] - t[0])
         picture = _small(images[row]) if images else None if render is None else render(s, _RENDERED_WIDTH)
         shots.append(Shot(s, T[row], picture))

@@ -54,6 +54,25 @@ def find_format(path: Path | str) -> Format:
     raise DataError(f"{path}: expected a folder of {expected}, got {found(path)}")
 
 
+def has_timestamps(path: Path | str, format: Format) -> bool:
+    """Whether the frames of a recording have timestamps, or a rate has to be assumed.
+
+    Args:
+        path: its folder.
+        format: its layout.
+
+    Returns:
+        True where the files state when each frame was taken.
+    """
+    if format != "plain":
+        return format in ("tum", "euroc")
+    folder = Path(path)
+    if (folder / "times.txt").is_file() or not (folder / "poses.txt").is_file():
+        return (folder / "times.txt").is_file()
+    lines = (line for line in (folder / "poses.txt").read_text("utf-8").splitlines() if line.strip())
+    return next((len(line.split()) == 8 for line in lines if not line.startswith("#")), False)
+
+
 def load_recording(path: Path | str, format: Format | None = None, *, rate_hz: float = 30.0) -> Recording:
     """Read a recording in the layout `format`, or in the one that `find_format` finds.
 

@@ -26,17 +26,17 @@ from jaxpose.imu import ADIS16448, GRAVITY_WORLD, ImuNoise
 class RoomConfig:
     """Settings of `room`; every random choice follows from `seed`."""
 
-    duration_s: float = 12.0
-    rate_hz: float = 5.0
-    imu_rate_hz: float = 200.0
-    width: int = 320
-    height: int = 240
-    seed: int = 0
+    duration_s: float = 12.0  # [s] of the walk
+    rate_hz: float = 5.0  # [Hz] of the frames
+    imu_rate_hz: float = 200.0  # [Hz] of the IMU
+    width: int = 320  # [px] of the images
+    height: int = 240  # [px] of the images
+    seed: int = 0  # of the room, the walk and the noise of its sensors
     speed: float = 1.0  # 1 walks at about 0.5 m/s and turns by 20 to 50 deg/s
     depth_noise: float = 1.0  # times Kinect's; 0 is exact depth
     holes: bool = True  # no depth in the projector's shadow and on grazing surfaces
     imu_noise: ImuNoise = ADIS16448
-    gravity_world: tuple[float, float, float] = GRAVITY_WORLD
+    gravity_world: tuple[float, float, float] = GRAVITY_WORLD  # [m/s^2] z is up
     # A EuRoC sequence whose recorded motion and IMU take the place of the walk and of `imu_*`.
     along: Path | None = None
 

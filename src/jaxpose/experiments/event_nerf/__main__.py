@@ -1,5 +1,6 @@
 """`python -m jaxpose.experiments.event_nerf`."""
 
-from jaxpose.experiments.event_nerf.pipeline import main
+from jaxpose.experiments.command import start
 
-main()
+if __name__ == "__main__":
+    start("jaxpose.experiments.event_nerf.pipeline")

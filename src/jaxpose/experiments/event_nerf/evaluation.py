@@ -13,9 +13,10 @@ from jaxpose.datasets.types import Photographs, take
 from jaxpose.evaluation import trajectory_error
 from jaxpose.evaluation.trajectory_error import PoseErrors
 from jaxpose.events import GAMMA, contrast, log_intensity
+from jaxpose.experiments.event_nerf.model import Model
 from jaxpose.experiments.event_nerf.options import Problem
-from jaxpose.experiments.event_nerf.setup import Setup
 from jaxpose.experiments.image_metrics import image_metrics, means, pose_numbers
+from jaxpose.experiments.progress import OnUpdate, Update
 from jaxpose.experiments.training_loop import pose_reader
 from jaxpose.fields import piecewise_geodesic, set_progress
 from jaxpose.geometry.rigid import Similarity, vector_angle
@@ -35,12 +36,12 @@ PROTOCOL = {
     "translation_error": "distance of world-to-camera translation vectors after alignment, mean over the "
     "same, as BARF defines it [scene units]",
     "centre_error": "distance of camera centres after alignment, mean over the same [scene units]",
-    "psnr, ssim, lpips": "mean over the held-out views, their true poses brought into the estimate's frame "
-    "by the alignment, no test-time optimisation; first slope and offset of log intensity are fitted for "
-    "each colour over all views, as EventNeRF does",
+    "image_metrics": "psnr, ssim, lpips: mean over the held-out views, their true poses brought into the "
+    "estimate's frame by the alignment, no test-time refinement; first slope and offset of log intensity are "
+    "fitted for each colour over all views, as EventNeRF does",
     "frames": "the same numbers for the camera's own images during the events, rendered at their timestamps",
-    "slide": "way of the camera from first to last event in its own axes and its angle to the true way; "
-    "variance of the warped events along multiples of that way, depths as rendered",
+    "displacement": "of the camera from first to last event in its own axes, and its angle to the true one; "
+    "variance of the warped events along multiples of it, depths as rendered",
 }
 
 
@@ -75,24 +76,26 @@ def find_truth(problem: Problem) -> GroundTruth | None:
     return GroundTruth(recording.t[at], recording.T_world_cam[at], np.asarray(T_start, np.float64))
 
 
-def measure(problem: Problem, setup: Setup, state: State, ground_truth: GroundTruth | None) -> Measured:
+def measure(
+    problem: Problem, model: Model, state: State, ground_truth: GroundTruth | None, on_update: OnUpdate
+) -> Measured:
     """Errors of the trained trajectory, what the scene shows, and how sharp the motion makes the events."""
     scene = set_progress(state.scene, jnp.ones(()))
     recording = problem.recording
     # Twice as finely as in training, whose samples are drawn anew in every step.
-    finely = TrainConfig(steps=1, rays=1, samples=2 * setup.train.samples, chunk=64)
+    finely = TrainConfig(steps=1, rays=1, samples=2 * model.train.samples, chunk=64)
     look = lambda camera: (
-        photometric.viewer(setup.scene, camera, problem.depths, finely, background=problem.background).image
+        photometric.viewer(model.scene, camera, problem.depths, finely, background=problem.background).image
     )
     at_start = at_end = None
     numbers: dict[str, Any] = {}
     to_truth = Similarity(1.0, np.eye(3), np.zeros(3))
     views, seen = [], {"psnr": None, "ssim": None, "lpips": None}
     if ground_truth is not None:
-        estimate = pose_reader(setup.field, ground_truth.t)(state.pose)
+        estimate = pose_reader(model.field, ground_truth.t)(state.pose)
         at_end = trajectory_error.pose_errors(estimate, ground_truth.T_world_cam)
         at_start = trajectory_error.pose_errors(ground_truth.T_start, ground_truth.T_world_cam)
-        extent = problem.about["extent"]
+        extent = problem.metadata["extent"]
         numbers = pose_numbers(at_end, extent) | {"start": pose_numbers(at_start, extent)}
         numbers["constant_rotation_error_deg"] = constant_rotation_deg(
             trajectory_error.align(at_end.alignment, estimate), ground_truth.T_world_cam
@@ -101,7 +104,7 @@ def measure(problem: Problem, setup: Setup, state: State, ground_truth: GroundTr
         if recording.held_out is not None:
             to_estimate = trajectory_error.procrustes(ground_truth.T_world_cam, estimate)
             poses = trajectory_error.align(to_estimate, recording.held_out.T_world_cam)
-            views = _seen(look(recording.held_out.camera), scene, recording.held_out, poses, setup)
+            views = _seen(look(recording.held_out.camera), scene, recording.held_out, poses, model, on_update)
             seen = _alike(views)
     numbers |= seen
     frames = []
@@ -109,11 +112,13 @@ def measure(problem: Problem, setup: Setup, state: State, ground_truth: GroundTr
         inside = (recording.frames.t >= problem.span[0]) & (recording.frames.t <= problem.span[1])
         photographs = take(recording.frames, np.flatnonzero(inside))
         if len(photographs.t):
-            poses = pose_reader(setup.field, photographs.t)(state.pose)
-            frames = _seen(look(recording.camera), scene, photographs, poses, setup)
+            poses = pose_reader(model.field, photographs.t)(state.pose)
+            frames = _seen(look(recording.camera), scene, photographs, poses, model, on_update)
             numbers["frames"] = _alike(frames)
     if problem.slides:
-        numbers["slide"] = _slide(problem, setup, state, scene, ground_truth, look(recording.camera))
+        numbers["displacement"] = _displacement(
+            problem, model, state, scene, ground_truth, look(recording.camera)
+        )
     return Measured(numbers, views, frames, at_start, at_end, to_truth)
 
 
@@ -131,7 +136,7 @@ def corrected(
     """Renders in [0, 1] whose log intensity is mapped to ground truth's by a slope and an offset per colour.
 
     Events tell changes only: brightness and contrast of what is made from them are not known. Least squares
-    over all views (EventNeRF, PEERS B4).
+    over all views (EventNeRF, Rudnev et al. 2023).
     """
     result = np.empty_like(rendered)
     for colour in range(3):
@@ -147,12 +152,16 @@ def _seen(
     scene: Any,
     photographs: Photographs,
     poses: Float[np.ndarray, "n 4 4"],
-    setup: Setup,
+    model: Model,
+    on_update: OnUpdate,
 ) -> list[HeldOut]:
     """What the scene shows from poses beside photographs, its log intensity corrected to theirs."""
-    rendered = [image(scene, jnp.asarray(T, jnp.float32)) for T in poses]
+    rendered = []
+    for number, T in enumerate(poses):
+        on_update(Update("rendering views", number, len(poses), "views"))
+        rendered.append(jax.block_until_ready(image(scene, jnp.asarray(T, jnp.float32))))
     rgb = np.clip(np.stack([np.asarray(colour, np.float64) for colour, _ in rendered]), 0, 1)
-    rgb = corrected(rgb, photographs.rgb / 255, setup.train.offset)
+    rgb = corrected(rgb, photographs.rgb / 255, model.train.offset)
     return [
         HeldOut(name, photograph, colour, np.asarray(depth, np.float64))
         for name, photograph, colour, (_, depth) in zip(
@@ -165,9 +174,9 @@ def _alike(views: list[HeldOut]) -> dict[str, float | None]:
     return means([image_metrics(view.rendered_rgb, view.rgb / 255) for view in views])
 
 
-def _slide(
+def _displacement(
     problem: Problem,
-    setup: Setup,
+    model: Model,
     state: State,
     scene: Any,
     ground_truth: GroundTruth | None,
@@ -179,29 +188,32 @@ def _slide(
     """
     first, last = problem.span
     ends = np.array([first, (first + last) / 2, last])
-    T_first, T_middle, T_last = pose_reader(setup.field, ends)(state.pose)
-    way = T_middle[:3, :3].T @ (T_last[:3, 3] - T_first[:3, 3])
+    T_first, T_middle, T_last = pose_reader(model.field, ends)(state.pose)
+    displacement = T_middle[:3, :3].T @ (T_last[:3, 3] - T_first[:3, 3])
     recording = problem.recording
     _, depth = image(scene, jnp.asarray(T_middle, jnp.float32))
     nearness = 1 / np.maximum(np.asarray(depth), 1e-3)[recording.events.y, recording.events.x]
     located = contrast.locate(recording.camera, recording.events)
     contrast_of = jax.jit(
-        lambda way: jnp.var(
-            contrast.warped(recording.camera, located, jnp.asarray(nearness), way / (last - first))
+        lambda displacement: jnp.var(
+            contrast.warped(recording.camera, located, jnp.asarray(nearness), displacement / (last - first))
         )
     )
     result: dict[str, Any] = {
-        "way": way,
-        "contrast": {f"{k:g}": float(contrast_of(jnp.asarray(k * way, jnp.float32))) for k in _MULTIPLES},
+        "displacement": displacement,
+        "contrasts": [
+            {"multiple": k, "contrast": float(contrast_of(jnp.asarray(k * displacement, jnp.float32)))}
+            for k in _MULTIPLES
+        ],
     }
     if ground_truth is None:
         return result
     T_true = ground_truth.T_world_cam
-    true_way = T_true[len(T_true) // 2, :3, :3].T @ (T_true[-1, :3, 3] - T_true[0, :3, 3])
+    true_displacement = T_true[len(T_true) // 2, :3, :3].T @ (T_true[-1, :3, 3] - T_true[0, :3, 3])
     begins = problem.start.T[-1, :3, 3] - problem.start.T[0, :3, 3]
     return result | {
-        "direction_error_deg": _angle_deg(way, true_way),
-        "start_direction_error_deg": _angle_deg(begins, true_way),
+        "direction_error_deg": _angle_deg(displacement, true_displacement),
+        "start_direction_error_deg": _angle_deg(begins, true_displacement),
     }
 
 

@@ -16,20 +16,25 @@ from typing import Any
 import numpy as np
 
 from jaxpose.evaluation import trajectory_error
-from jaxpose.experiments import command, training_loop
+from jaxpose.experiments import training_loop
+from jaxpose.experiments.command import MODULE, Command, execute
 from jaxpose.experiments.event_nerf.evaluation import PROTOCOL, GroundTruth, Measured, find_truth, measure
+from jaxpose.experiments.event_nerf.model import Model, build, describe
 from jaxpose.experiments.event_nerf.options import (
+    GROUPS,
+    ORBIT,
     Config,
     Problem,
-    Study,
     begin,
     load,
     read,
     resume_fingerprint,
+    studies,
 )
-from jaxpose.experiments.event_nerf.report import progress_bar, report, table
-from jaxpose.experiments.event_nerf.setup import Setup, build, describe
-from jaxpose.experiments.training_loop import Loaded, OnProgress, Outcome, Trained
+from jaxpose.experiments.event_nerf.report import describe_step, report, table
+from jaxpose.experiments.outcome import Outcome
+from jaxpose.experiments.progress import OnUpdate, Update, silent
+from jaxpose.experiments.training_loop import Loaded, Trained
 from jaxpose.fields.serialization import write_field
 from jaxpose.files import atomic, run_folder, trajectories
 from jaxpose.files.camera_json import write_camera
@@ -37,75 +42,85 @@ from jaxpose.plots import events as event_plots
 from jaxpose.plots import nerf as nerf_plots
 from jaxpose.training.steps import State
 
-_KNOWN = (20, 10, 6)  # table 4
-_OFFSETS_DEG = (1.0, 2.0, 2.85)  # EventNeRF reports up to 2.85 on real turntables
 
-
-def run(config: Config, on_progress: OnProgress | None = None) -> Outcome:
+def run(config: Config, on_update: OnUpdate = silent) -> Outcome:
     """Train, measure and write the run folder; `resume` goes on where a killed run stopped.
 
-    Raises DataError or OSError for what cannot be used; then no folder is left behind.
+    Args:
+        config: the data and how to train on them.
+        on_update: called with what the run is doing.
+
+    Returns:
+        The run folder, and its results; those of a study under `runs`, by label.
+
+    Raises:
+        DataError, OSError: for what cannot be read, trained on or written; then no folder is left behind.
     """
     started = time.perf_counter()
+    path = run_folder.folder_path("event_nerf", name=config.name, out=config.out)
+    on_update(Update(f"run folder {path}"))
+    on_update(Update("making the events" if config.data == ORBIT else f"reading {config.data}"))
     recording = read(config)
     problem = begin(config, recording)
-    with run_folder.opened(run_folder.folder_path("event_nerf", name=config.name, out=config.out)) as folder:
+    with run_folder.opened(path) as folder:
         if config.study is None:
-            return Outcome(folder, _single(config, problem, folder, on_progress, ""))
+            return Outcome(folder, _single(config, problem, folder, on_update, ""))
         results = {}
-        for label, changed in _study(config, config.study).items():
+        for label, changed in studies(config, config.study).items():
             changed = replace(changed, study=None)
             with run_folder.opened(folder / label) as inner:
-                results[label] = _single(changed, begin(changed, recording), inner, on_progress, label)
+                results[label] = _single(changed, begin(changed, recording), inner, on_update, label)
         return training_loop.write_study(folder, "event_nerf", config, results, table(results), started)
 
 
-def load_run(folder: Path | str) -> Loaded[Problem, Setup]:
-    """What a run has left in its folder, as `joint_loop.load_run`."""
+def load_run(folder: Path | str) -> Loaded[Problem, Model]:
+    """What a run has left in its folder.
+
+    Args:
+        folder: the run folder.
+
+    Returns:
+        Data, model and its trained state.
+
+    Raises:
+        DataError, OSError: for a folder that holds no such run.
+    """
     return training_loop.load_run(folder, Config, load, build)
 
 
-def main(args: Sequence[str] | None = None) -> None:
-    """The command: `python -m jaxpose.experiments.event_nerf`."""
-    config = command.parse("event_nerf", Config, __doc__, args)
-    command.guarded("event_nerf", lambda: report(*run(config, progress_bar())))
+def main(args: Sequence[str] | None = None, prog: str = MODULE + "event_nerf") -> None:
+    """The command `jaxpose events`.
 
-
-def _study(config: Config, study: Study) -> dict[str, Config]:
-    """The configs of runs side by side, by label."""
-    if study == "known":
-        changes = {f"known{known}": {"known": known} for known in _KNOWN}
-    else:
-        changes = {f"offset{offset:g}": {"axis_offset_deg": offset} for offset in _OFFSETS_DEG}
-    return {
-        f"{label}-{pose}": replace(config, pose=pose, **change)
-        for label, change in changes.items()
-        for pose in ("linear", "posenet")
-    }
+    Args:
+        args: the command line; None is that of this process.
+        prog: the command as it is typed.
+    """
+    execute(Command(prog, Config, __doc__, run, lambda result: report(*result), GROUPS), args)
 
 
 def _single(
-    config: Config, problem: Problem, folder: Path, on_progress: OnProgress | None, label: str
+    config: Config, problem: Problem, folder: Path, on_update: OnUpdate, label: str
 ) -> dict[str, Any]:
     """One training, measured and written; what a killed or finished run has left is used with `resume`."""
     started = time.perf_counter()
     finished = folder / "results.json"
-    training_loop.set_up_run_folder(folder, config, resume_fingerprint(config), resume=config.resume)
+    training_loop.set_up_run_folder(folder, config, resume_fingerprint(config))
     if finished.exists():
         return json.loads(finished.read_text())
-    setup = build(config, problem)
+    model = build(config, problem)
     ground_truth = find_truth(problem)
-    trained = _train(config, problem, setup, ground_truth, folder / "checkpoint.npz", on_progress, label)
-    measured = measure(problem, setup, trained.state, ground_truth)
+    trained = _train(config, problem, model, ground_truth, folder / "checkpoint.npz", on_update, label)
+    measured = measure(problem, model, trained.state, ground_truth, on_update)
+    on_update(Update("drawing figures"))
     _draw(folder, config, problem, measured, ground_truth)
-    _write_poses(folder, problem, setup, trained.state, measured)
+    _write_poses(folder, problem, model, trained.state, measured)
     results = training_loop.results_of(
         "event_nerf",
         config,
         trained,
         started,
-        data=problem.about,
-        training=describe(config, setup),
+        data=problem.metadata,
+        training=describe(config, model),
         protocol=PROTOCOL,
         **measured.numbers,
     )
@@ -116,34 +131,34 @@ def _single(
 def _train(
     config: Config,
     problem: Problem,
-    setup: Setup,
+    model: Model,
     ground_truth: GroundTruth | None,
     checkpoint: Path,
-    on_progress: OnProgress | None,
+    on_update: OnUpdate,
     label: str,
 ) -> Trained:
     if ground_truth is None:
         errors = lambda params: (np.nan, np.nan)
     else:
-        poses = training_loop.pose_reader(setup.field, ground_truth.t)
+        poses = training_loop.pose_reader(model.field, ground_truth.t)
         errors = lambda params: training_loop.mean_errors(poses(params), ground_truth.T_world_cam)
 
     return training_loop.train(
-        setup,
-        training_loop.initial_state(setup, config.seed),
-        setup.data,
+        model,
+        training_loop.initial_state(model, config.seed),
+        model.data,
         errors,
         checkpoint,
-        on_progress,
+        on_update,
         label=label,
-        extent=problem.extent,
+        describe=describe_step,
     )
 
 
 def _draw(
     folder: Path, config: Config, problem: Problem, measured: Measured, ground_truth: GroundTruth | None
 ) -> None:
-    numbers, about, recording = measured.numbers, problem.about, problem.recording
+    numbers, about, recording = measured.numbers, problem.metadata, problem.recording
     title = f"{about['data']}, {about['events']} events\n{about['poses']}"
     method = f"{config.pose}, {config.loss} loss"
     camera = recording.camera
@@ -169,7 +184,7 @@ def _draw(
         )
 
 
-def _write_poses(folder: Path, problem: Problem, setup: Setup, state: State, measured: Measured) -> None:
+def _write_poses(folder: Path, problem: Problem, model: Model, state: State, measured: Measured) -> None:
     """The trajectory, aligned with ground truth where there is any.
 
     At its timestamps and as a continuous field.
@@ -182,9 +197,9 @@ def _write_poses(folder: Path, problem: Problem, setup: Setup, state: State, mea
         reference = recording.T_world_cam[np.isin(recording.t, t)]
         trajectories.write_tum(folder / "reference.txt", trajectories.Trajectory(t, reference))
     estimate = trajectory_error.align(
-        measured.alignment, training_loop.pose_reader(setup.field, t)(state.pose)
+        measured.alignment, training_loop.pose_reader(model.field, t)(state.pose)
     )
     trajectories.write_tum(folder / "trajectory.txt", trajectories.Trajectory(t, estimate))
     trajectories.write_tum(folder / "start.txt", problem.start)
-    write_field(folder / "field.npz", problem.span, setup.factors(state.pose), alignment=measured.alignment)
+    write_field(folder / "field.npz", problem.span, model.factors(state.pose), alignment=measured.alignment)
     write_camera(folder / "camera.json", recording.camera, (), ".")

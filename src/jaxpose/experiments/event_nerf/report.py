@@ -1,11 +1,9 @@
-"""What the event experiment says: a bar while it trains, then numbers with their protocol."""
+"""What the event experiment prints: progress, then numbers with their protocol."""
 
 from pathlib import Path
 from typing import Any
 
-from jaxpose.experiments import training_loop
-from jaxpose.experiments.command import markdown_table, number
-from jaxpose.experiments.training_loop import OnProgress, Progress
+from jaxpose.experiments.outcome import SMOKE, cost_text, markdown_table, number
 
 _COLUMNS: tuple[str, ...] = (
     "run", "RE start", "RE [deg]", "TE start", "TE [units]", "TE [%]", "PSNR [dB]", "SSIM", "LPIPS",
@@ -13,14 +11,18 @@ _COLUMNS: tuple[str, ...] = (
 )  # fmt: skip
 
 
-def progress_bar() -> OnProgress:
-    """A callback for `run` that draws a bar on stderr for each training."""
+def describe_step(loss: float, rotation_deg: float, translation: float) -> dict[str, str]:
+    """Where a training is, in words.
 
-    def describe(progress: Progress) -> dict[str, str]:
-        off = f"{progress.rotation_deg:.2f} deg {progress.translation:.4f} units"
-        return {"loss": f"{progress.loss:.5f}", "off": off}
+    Args:
+        loss: of the events.
+        rotation_deg: mean rotation error [deg].
+        translation: mean translation error [scene units].
 
-    return training_loop.progress_bar(describe)
+    Returns:
+        The words by their names.
+    """
+    return {"loss": f"{loss:.5f}", "off": f"{rotation_deg:.2f} deg {translation:.4f} units"}
 
 
 def table(runs: dict[str, dict[str, Any]]) -> str:
@@ -49,7 +51,7 @@ def report(folder: Path, results: dict[str, Any]) -> str:
     one = next(iter(runs.values()))
     data, training, protocol = one["data"], one["training"], one["protocol"]
     width, height = data["size"]
-    smoke = "  SMOKE RUN, the numbers mean nothing" if results["smoke"] else ""
+    smoke = SMOKE if results["smoke"] else ""
     lines = [
         f"event_nerf: {data['data']}, {data['events']} events of {width}x{height} ({data['mosaic']}) in "
         f"{data['span_s']:.3g} s, preset {training['preset']}, {training['steps']} steps of "
@@ -64,16 +66,15 @@ def report(folder: Path, results: dict[str, Any]) -> str:
         f"  TE           {protocol['translation_error']}; in percent of the cameras' extent, "
         f"{data['extent']:.3g}",
         f"  alignment    {protocol['alignment']}",
-        f"  PSNR ...     {protocol['psnr, ssim, lpips']}",
-        *(line for run in runs.values() for line in _beside(run)),
-        f"  cost         {results['wall_s']:.0f} s in all, "
-        f"{results['peak_rss_bytes'] / 2**30:.2f} GiB of memory at most",
+        f"  PSNR ...     {protocol['image_metrics']}",
+        *(line for run in runs.values() for line in _more(run)),
+        f"  cost         {cost_text(results)}",
         f"  written to   {folder}",
     ]
     return "\n".join(lines)
 
 
-def _beside(run: dict[str, Any]) -> list[str]:
+def _more(run: dict[str, Any]) -> list[str]:
     """What only some data have: the camera's own images, a motion that was not known."""
     lines = []
     if "axis wrong" in run["data"]["poses"]:
@@ -85,13 +86,13 @@ def _beside(run: dict[str, Any]) -> list[str]:
         lines.append(
             f"  frames       PSNR {frames['psnr']:.2f} dB, SSIM {frames['ssim']:.3f} beside the camera's own"
         )
-    if "slide" in run:
-        slide = run["slide"]
-        contrasts = ", ".join(f"{value:.2f} at {k}" for k, value in slide["contrast"].items())
+    if "displacement" in run:
+        found = run["displacement"]
+        contrasts = ", ".join(f"{at['contrast']:.2f} at {at['multiple']:g}" for at in found["contrasts"])
         lines.append(f"  contrast     of events warped along multiples of the motion found: {contrasts}")
-        if "direction_error_deg" in slide:
+        if "direction_error_deg" in found:
             lines.append(
-                f"  direction    {slide['direction_error_deg']:.2f} deg from the true one, "
-                f"{slide['start_direction_error_deg']:.2f} at the start"
+                f"  direction    {found['direction_error_deg']:.2f} deg from the true one, "
+                f"{found['start_direction_error_deg']:.2f} at the start"
             )
     return lines

@@ -1,5 +1,6 @@
 """`python -m jaxpose.experiments.noisy_nerf`."""
 
-from jaxpose.experiments.noisy_nerf.pipeline import main
+from jaxpose.experiments.command import start
 
-main()
+if __name__ == "__main__":
+    start("jaxpose.experiments.noisy_nerf.pipeline")

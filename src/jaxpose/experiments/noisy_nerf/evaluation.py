@@ -1,4 +1,4 @@
-"""How good a training is: pose errors against ground truth, held-out views with and without settling them."""
+"""Errors of a training: of its poses, and of held-out views, with and without test-time pose refinement."""
 
 from typing import Any, NamedTuple
 
@@ -9,8 +9,9 @@ from jaxtyping import Float, PRNGKeyArray
 
 from jaxpose.evaluation import trajectory_error
 from jaxpose.experiments.image_metrics import image_metrics, means, pose_numbers
+from jaxpose.experiments.noisy_nerf.model import Model
 from jaxpose.experiments.noisy_nerf.options import Config, Problem
-from jaxpose.experiments.noisy_nerf.setup import Setup
+from jaxpose.experiments.progress import OnUpdate, Update
 from jaxpose.fields import set_progress
 from jaxpose.geometry.rigid import Similarity
 from jaxpose.plots.nerf import HeldOut
@@ -25,8 +26,9 @@ PROTOCOL = {
     "translation_error": "distance of world-to-camera translation vectors after alignment, mean over the "
     "training views, as BARF defines it [scene units]",
     "centre_error": "distance of camera centres after alignment, mean over training views [scene units]",
-    "psnr, ssim, lpips": "mean over the held-out views, their true poses brought into the estimate's frame "
-    "by the alignment; settled: after test-time optimisation of each pose on its photograph",
+    "image_metrics": "psnr, ssim, lpips: mean over the held-out views, their true poses brought into the "
+    "estimate's frame by the alignment; test_time_refined: after test-time refinement of each pose on its "
+    "photograph",
 }
 
 
@@ -41,7 +43,12 @@ class Measured(NamedTuple):
 
 
 def measure(
-    config: Config, problem: Problem, setup: Setup, state: State, T_world_cam: Float[np.ndarray, "n 4 4"]
+    config: Config,
+    problem: Problem,
+    model: Model,
+    state: State,
+    T_world_cam: Float[np.ndarray, "n 4 4"],
+    on_update: OnUpdate,
 ) -> Measured:
     """Errors of the trained poses, and of what the scene shows from held-out ones."""
     ground_truth = problem.train.T_world_cam
@@ -49,29 +56,31 @@ def measure(
     at_start = trajectory_error.pose_errors(problem.T_start, ground_truth)
     to_estimate = trajectory_error.procrustes(ground_truth, T_world_cam)
     viewer = photometric.viewer(
-        setup.scene,
+        model.scene,
         problem.train.camera,
-        setup.depths,
-        setup.train,
-        settle_steps=config.settle_steps,
-        settle_rate=setup.settle_rate,
+        model.depths,
+        model.train,
+        settle_steps=config.test_pose_steps,
+        settle_rate=model.settle_rate,
     )
     scene = set_progress(state.scene, jnp.ones(()))
     keys = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), 1), len(problem.held_out.t))
-    as_aligned, as_settled, views = [], [], []
+    as_aligned, as_refined, views = [], [], []
+    on_update(Update("rendering held-out views", 0, len(keys), "views"))
     for index, key in enumerate(keys):
         pose = trajectory_error.align(to_estimate, problem.held_out.T_world_cam[index : index + 1])[0]
         image, view = _seen(viewer, scene, problem, index, pose)
         as_aligned.append(image)
         views.append(view)
-        if config.settle_steps:
-            as_settled.append(_settled(viewer, scene, problem, index, pose, key))
+        if config.test_pose_steps:
+            as_refined.append(_test_time_refined(viewer, scene, problem, index, pose, key))
+        on_update(Update("rendering held-out views", index + 1, len(keys), "views"))
     numbers = {
         **pose_numbers(errors, problem.extent),
         **means(as_aligned),
-        "settled": means(as_settled) if as_settled else None,
+        "test_time_refined": means(as_refined) if as_refined else None,
         "start": pose_numbers(at_start, problem.extent),
-        "largest": {
+        "max": {
             "rotation_error_deg": np.nanmax(errors.rotation_errors_deg),
             "translation_error": np.nanmax(errors.translation_errors),
         },
@@ -86,7 +95,7 @@ def measure(
     )
 
 
-def _settled(
+def _test_time_refined(
     viewer: Viewer,
     scene: Any,
     problem: Problem,

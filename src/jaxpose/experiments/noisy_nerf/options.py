@@ -1,8 +1,9 @@
 """Options of the noisy-pose experiment, and the photographs and disturbed poses that they name."""
 
-from dataclasses import dataclass, fields
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from jaxtyping import Float
@@ -13,15 +14,24 @@ from jaxpose.datasets.synthetic import pose_noise
 from jaxpose.datasets.synthetic.orbit import DIAMETER, orbit
 from jaxpose.datasets.types import Photographs, every, take
 from jaxpose.errors import DataError
-from jaxpose.experiments.command import check_least, check_resume
+from jaxpose.experiments.checks import check_least, check_positive, check_run_folder, check_unused
 from jaxpose.experiments.training_loop import CHUNK, NetConfig
 from jaxpose.geometry import rigid
 
-Pose = Literal["posenet", "table", "bspline", "spline_reset"]
+Pose = Literal["posenet", "per_frame", "bspline", "spline_reset"]
 Study = Literal["fields", "encoding", "size", "spline", "ablations"]
 ORBIT = Path("orbit")
 _WIDTHS = {"fast": 100, "paper": 400}  # [px]
 _SMOKE_WIDTH, _SMOKE_VIEWS = 24, 8
+
+
+# The options of the first screen of help.
+GROUPS = {
+    "data": ("data", "image_width"),
+    "poses": ("noise", "noise_translation", "pose"),
+    "training": ("preset", "steps", "seed", "study"),
+    "run": ("out", "name", "resume", "smoke", "json"),
+}
 
 
 @dataclass(frozen=True)
@@ -36,44 +46,61 @@ class Config:
     # Of the poses that the run starts from. "none": as the data has them; "unknown": all in one place.
     noise: Literal["correlated", "independent", "none", "unknown"] = "correlated"
     noise_translation: float = 0.2  # largest deviation, as a share of the largest distance between cameras
-    noise_rotation_deg: float = 0.0  # largest deviation
+    noise_rotation_deg: float = 0.0  # [deg] largest deviation
     noise_sigma: float = 0.15  # of independent noise, BARF's [rad and scene units]
     # Which side of the camera's pose the noise is on, and the field that undoes it: the supplement's formula
     # has the world's, where turning goes about the world's origin; on the camera's it turns out of view.
     side: Literal["world", "camera"] = "world"
     every: int = 1  # use every n-th training image
     image_width: int | None = None  # [px] images are reduced to; None: 100, with preset paper 400
-    orbit_views: int = 100
+    orbit_views: int = 100  # photographs of the object that is made on the fly
     seed: int = 0  # of the noise, the network's start, the rays
     steps: int | None = None  # None: 5000, with preset paper 200,000
     rays: int | None = None  # per step; None: 1024, with preset paper 4096
     net: NetConfig = NetConfig()
     spline_knots: int = 25  # of both splines
     spline_smoothing: float = 1e-3  # of spline_reset: scipy's bound on the sum of squares, per dimension
-    settle_steps: int = 100  # of the test-time optimisation of held-out poses; 0: none
+    test_pose_steps: int = 100  # of test-time refinement of each held-out pose; 0: none
     study: Study | None = None  # runs of table 11 (fields), 3 (encoding), 12 (size), 10 (spline) side by side
     resume: bool = False  # go on where a killed run stopped
     smoke: bool = False  # everything shrunk to seconds; the numbers then mean nothing
     out: Path | None = None  # exactly this folder; None: outputs/noisy_nerf/<name or timestamp>
-    name: str | None = None  # of the run folder
+    name: str | None = None  # of the folder within outputs/noisy_nerf
+    json: bool = False  # print the results as JSON and nothing else
 
     def __post_init__(self):
         check_least(
             self,
-            noise_translation=0, noise_rotation_deg=0, noise_sigma=0, seed=0, settle_steps=0,
-            spline_smoothing=0, every=1, orbit_views=4, image_width=8, steps=CHUNK, rays=1, spline_knots=2,
+            noise_translation=0, noise_rotation_deg=0, noise_sigma=0, seed=0, test_pose_steps=0,
+            every=1, orbit_views=4, image_width=8, steps=CHUNK, rays=1, spline_knots=2,
         )  # fmt: skip
-        if self.spline_smoothing == 0:
-            raise ValueError("--spline-smoothing: expected a positive number, got 0")
+        check_positive(self, "spline_smoothing")
         if self.noise_rotation_deg > 180:
             raise ValueError(f"--noise-rotation-deg: expected at most 180, got {self.noise_rotation_deg:g}")
         if self.steps is not None and self.steps % CHUNK:
             raise ValueError(f"--steps: expected a multiple of {CHUNK}, got {self.steps}")
-        check_resume(self)
+        check_run_folder(self, None if self.data == ORBIT else self.data)
+        self._check_unused()
+
+    def _check_unused(self):
+        if self.noise != "correlated":
+            check_unused(self, ("noise_translation", "noise_rotation_deg"), f"with --noise {self.noise}")
+        if self.noise != "independent":
+            check_unused(self, ("noise_sigma",), f"with --noise {self.noise}")
+        if self.data != ORBIT:
+            check_unused(self, ("orbit_views",), "with --data")
+        if self.study is None and self.pose != "posenet":
+            check_unused(
+                self, [f"net.{name}" for name in self.net.__dataclass_fields__], f"with --pose {self.pose}"
+            )
+        if self.study is None and self.pose not in ("bspline", "spline_reset"):
+            check_unused(self, ("spline_knots",), f"with --pose {self.pose}")
+        if self.study is None and self.pose != "spline_reset":
+            check_unused(self, ("spline_smoothing",), f"with --pose {self.pose}")
 
 
 # What a run's numbers do not depend on.
-_INCIDENTAL = ("resume", "out", "name", "study")
+_INCIDENTAL = ("resume", "out", "name", "study", "json")
 
 
 def resume_fingerprint(config: Config) -> dict[str, Any]:
@@ -88,7 +115,7 @@ class Problem(NamedTuple):
     held_out: Photographs
     T_start: Float[np.ndarray, "n 4 4"]  # camera-to-world
     extent: float  # largest distance between true cameras [scene units]
-    about: dict[str, Any]  # the data and the noise in words and numbers
+    metadata: dict[str, Any]  # the data and the noise in words and numbers
 
 
 def load(config: Config) -> Problem:
@@ -102,7 +129,7 @@ def load(config: Config) -> Problem:
         raise DataError(f"{config.data}: expected at least 4 images to train on, got {len(train.t)}")
     extent = DIAMETER if config.data == ORBIT else float(pdist(train.T_world_cam[:, :3, 3]).max())
     T_start, words = _disturbed(config, train, extent)
-    about = {
+    metadata = {
         "data": "synthetic orbit" if config.data == ORBIT else train.name,
         "images": len(train.t),
         "held_out": len(held_out.t),
@@ -111,7 +138,7 @@ def load(config: Config) -> Problem:
         "noise": words,
         "notes": train.notes,
     }
-    return Problem(train, held_out, T_start, extent, about)
+    return Problem(train, held_out, T_start, extent, metadata)
 
 
 def _photographs(config: Config) -> tuple[Photographs, Photographs]:
@@ -175,3 +202,72 @@ def _disturbed(config: Config, train: Photographs, extent: float) -> tuple[Float
         return ground_truth @ T_noise, words
     # World-to-camera this is T_c,w . T_noise, as in the supplement's section 6.
     return rigid.inverse(T_noise) @ ground_truth, words
+
+
+# Label and variant of PoseNet in the order of table 3; coarse to fine opens its bands as BARF's scene does.
+_ENCODING = {
+    "linear_coupled": NetConfig(octaves=0, coupled=True),
+    "sin2_coupled": NetConfig(octaves=2, coupled=True),
+    "sin5_coupled": NetConfig(octaves=5, coupled=True),
+    "sin10_coupled": NetConfig(octaves=10, coupled=True),
+    "sin2": NetConfig(octaves=2),
+    "sin5": NetConfig(octaves=5),
+    "sin10": NetConfig(octaves=10),
+    "sigmoid": NetConfig(activation="sigmoid"),
+    "sin10_coarse_to_fine": NetConfig(octaves=10, window=(0.1, 0.5)),
+}
+_SIZE = {
+    f"layers{layers}_width{width}": NetConfig(layers=layers, width=width)
+    for layers in (8, 4)
+    for width in (256, 128)
+}
+_SPLINE = [(25, 1e-3), (25, 1e-2), (25, 1e-1), (25, 1.0), (75, 1e-3), (50, 1e-3)]  # knots and smoothing
+
+
+def _fields(config: Config) -> dict[str, Config]:
+    return {pose: replace(config, pose=pose) for pose in get_args(Pose)}
+
+
+def _encoding(config: Config) -> dict[str, Config]:
+    return {label: replace(config, pose="posenet", net=net) for label, net in _ENCODING.items()}
+
+
+def _size(config: Config) -> dict[str, Config]:
+    return {label: replace(config, pose="posenet", net=net) for label, net in _SIZE.items()}
+
+
+def _spline(config: Config) -> dict[str, Config]:
+    return {
+        f"knots{knots}_smoothing{smoothing:.0e}".replace("-", "m").replace("+", ""): replace(
+            config, pose="spline_reset", spline_knots=knots, spline_smoothing=smoothing
+        )
+        for knots, smoothing in _SPLINE
+    }
+
+
+def _ablations(config: Config) -> dict[str, Config]:
+    sizes = _size(config)
+    del sizes["layers8_width256"]  # it is sin5
+    return _encoding(config) | sizes | _spline(config)
+
+
+_STUDIES: dict[Study, Callable[[Config], dict[str, Config]]] = {
+    "fields": _fields,
+    "encoding": _encoding,
+    "size": _size,
+    "spline": _spline,
+    "ablations": _ablations,
+}
+
+
+def studies(config: Config, study: Study) -> dict[str, Config]:
+    """Runs side by side: the pose fields of table 11, the ablations of tables 3 (encoding), 12, 10 (spline).
+
+    Args:
+        config: what they share.
+        study: which runs.
+
+    Returns:
+        The config of each run, by its label.
+    """
+    return {label: replace(run, study=None) for label, run in _STUDIES[study](config).items()}

@@ -10,6 +10,7 @@ import json
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +20,23 @@ from jaxtyping import Float
 
 from jaxpose.datasets.photos import blender
 from jaxpose.datasets.photos.transforms_json import write_transforms
-from jaxpose.experiments import command, training_loop
+from jaxpose.experiments import training_loop
+from jaxpose.experiments.command import MODULE, Command, execute
 from jaxpose.experiments.noisy_nerf.evaluation import PROTOCOL, Measured, measure
-from jaxpose.experiments.noisy_nerf.options import ORBIT, Config, Problem, load, resume_fingerprint
-from jaxpose.experiments.noisy_nerf.report import progress_bar, report, table
-from jaxpose.experiments.noisy_nerf.setup import Setup, build, describe, splined
-from jaxpose.experiments.noisy_nerf.studies import STUDIES
-from jaxpose.experiments.training_loop import Loaded, OnProgress, Outcome, Trained
+from jaxpose.experiments.noisy_nerf.model import Model, build, describe, splined
+from jaxpose.experiments.noisy_nerf.options import (
+    GROUPS,
+    ORBIT,
+    Config,
+    Problem,
+    load,
+    resume_fingerprint,
+    studies,
+)
+from jaxpose.experiments.noisy_nerf.report import describe_step, report, table
+from jaxpose.experiments.outcome import Outcome
+from jaxpose.experiments.progress import OnUpdate, Update, silent
+from jaxpose.experiments.training_loop import Loaded, Trained
 from jaxpose.fields.serialization import write_field
 from jaxpose.files import atomic, run_folder, trajectories
 from jaxpose.files.camera_json import write_camera
@@ -33,20 +44,31 @@ from jaxpose.plots import nerf as nerf_plots
 from jaxpose.plots.nerf import History
 
 
-def run(config: Config, on_progress: OnProgress | None = None) -> Outcome:
+def run(config: Config, on_update: OnUpdate = silent) -> Outcome:
     """Train, measure and write the run folder; `resume` goes on where a killed run stopped.
 
-    Raises DataError or OSError for what cannot be used; then no folder is left behind.
+    Args:
+        config: the data and how to train on them.
+        on_update: called with what the run is doing.
+
+    Returns:
+        The run folder, and its results; those of a study under `runs`, by label.
+
+    Raises:
+        DataError, OSError: for what cannot be read, trained on or written; then no folder is left behind.
     """
     started = time.perf_counter()
+    path = run_folder.folder_path("noisy_nerf", name=config.name, out=config.out)
+    on_update(Update(f"run folder {path}"))
+    on_update(Update("making the photographs" if config.data == ORBIT else f"reading {config.data}"))
     problem = load(config)
-    with run_folder.opened(run_folder.folder_path("noisy_nerf", name=config.name, out=config.out)) as folder:
+    with run_folder.opened(path) as folder:
         if config.study is None:
-            return Outcome(folder, _single(config, problem, folder, on_progress, ""))
+            return Outcome(folder, _single(config, problem, folder, on_update, ""))
         results, histories = {}, {}
-        for label, changed in STUDIES[config.study](config).items():
+        for label, changed in studies(config, config.study).items():
             with run_folder.opened(folder / label) as inner:
-                results[label] = _single(replace(changed, study=None), problem, inner, on_progress, label)
+                results[label] = _single(replace(changed, study=None), problem, inner, on_update, label)
             histories[label] = _history(np.array(results[label]["history"], float))
         nerf_plots.curves(folder / "curves.png", histories, f"{_title(problem)}: {config.study}")
         return training_loop.write_study(folder, "noisy_nerf", config, results, table(results), started)
@@ -55,13 +77,13 @@ def run(config: Config, on_progress: OnProgress | None = None) -> Outcome:
 def train(
     config: Config,
     problem: Problem,
-    setup: Setup,
+    model: Model,
     checkpoint: Path,
-    on_progress: OnProgress | None,
+    on_update: OnUpdate,
     label: str,
 ) -> Trained:
     """Train to the end, from the checkpoint if there is one, and keep one as it goes."""
-    poses = training_loop.pose_reader(setup.field, problem.train.t)
+    poses = training_loop.pose_reader(model.field, problem.train.t)
 
     def between(state):
         if config.pose != "spline_reset":
@@ -70,54 +92,69 @@ def train(
         return state._replace(pose=smooth)
 
     return training_loop.train(
-        setup,
-        training_loop.initial_state(setup, config.seed),
-        setup.views,
+        model,
+        training_loop.initial_state(model, config.seed),
+        model.views,
         lambda params: training_loop.mean_errors(poses(params), problem.train.T_world_cam),
         checkpoint,
-        on_progress,
+        on_update,
         label=label,
-        extent=problem.extent,
+        describe=partial(describe_step, problem.extent),
         between=between,
     )
 
 
-def load_run(folder: Path | str) -> Loaded[Problem, Setup]:
-    """What a run has left in its folder, as `joint_loop.load_run`."""
+def load_run(folder: Path | str) -> Loaded[Problem, Model]:
+    """What a run has left in its folder.
+
+    Args:
+        folder: the run folder.
+
+    Returns:
+        Data, model and its trained state.
+
+    Raises:
+        DataError, OSError: for a folder that holds no such run.
+    """
     return training_loop.load_run(folder, Config, load, build)
 
 
-def main(args: Sequence[str] | None = None) -> None:
-    """The command: `python -m jaxpose.experiments.noisy_nerf`."""
-    config = command.parse("noisy_nerf", Config, __doc__, args)
-    command.guarded("noisy_nerf", lambda: report(*run(config, progress_bar())))
+def main(args: Sequence[str] | None = None, prog: str = MODULE + "noisy_nerf") -> None:
+    """The command `jaxpose nerf`.
+
+    Args:
+        args: the command line; None is that of this process.
+        prog: the command as it is typed.
+    """
+    execute(Command(prog, Config, __doc__, run, lambda result: report(*result), GROUPS), args)
 
 
 def _single(
-    config: Config, problem: Problem, folder: Path, on_progress: OnProgress | None, label: str
+    config: Config, problem: Problem, folder: Path, on_update: OnUpdate, label: str
 ) -> dict[str, Any]:
     """One training, measured and written; what a killed or finished run has left is used with `resume`."""
     started = time.perf_counter()
     checkpoint, finished = folder / "checkpoint.npz", folder / "results.json"
-    training_loop.set_up_run_folder(folder, config, resume_fingerprint(config), resume=config.resume)
+    training_loop.set_up_run_folder(folder, config, resume_fingerprint(config))
     if finished.exists():
         return json.loads(finished.read_text())
-    setup = build(config, problem)
-    trained = train(config, problem, setup, checkpoint, on_progress, label)
-    T_world_cam = training_loop.pose_reader(setup.field, problem.train.t)(trained.state.pose)
-    measured = measure(config, problem, setup, trained.state, T_world_cam)
+    model = build(config, problem)
+    trained = train(config, problem, model, checkpoint, on_update, label)
+    T_world_cam = training_loop.pose_reader(model.field, problem.train.t)(trained.state.pose)
+    measured = measure(config, problem, model, trained.state, T_world_cam, on_update)
+    on_update(Update("drawing figures"))
     _draw(folder, config, problem, measured, trained)
     _write_poses(folder, config, problem, measured)
     span = (float(problem.train.t[0]), float(problem.train.t[-1]))
-    factors = setup.factors(trained.state.pose)
+    factors = model.factors(trained.state.pose)
     write_field(folder / "field.npz", span, factors, alignment=measured.alignment)
     results = training_loop.results_of(
         "noisy_nerf",
         config,
         trained,
         started,
-        data=problem.about,
-        training=describe(config, setup),
+        data=problem.metadata,
+        training=describe(config, model),
         protocol=PROTOCOL,
         **measured.numbers,
     )
@@ -177,8 +214,8 @@ def _images_folder(data: Path) -> Path:
 
 
 def _title(problem: Problem) -> str:
-    width, height = problem.about["size"]
-    about = problem.about
+    width, height = problem.metadata["size"]
+    about = problem.metadata
     return f"{about['data']}, {about['images']} views of {width}x{height}\nnoise {about['noise']}"
 
 

@@ -1,27 +1,30 @@
-"""What the noisy-pose experiment says: a bar while it trains, then numbers with their protocol."""
+"""What the noisy-pose experiment prints: progress, then numbers with their protocol."""
 
 import math
 from pathlib import Path
 from typing import Any
 
-from jaxpose.experiments import training_loop
-from jaxpose.experiments.command import markdown_table, number
-from jaxpose.experiments.training_loop import OnProgress, Progress
+from jaxpose.experiments.outcome import SMOKE, cost_text, markdown_table, number
 
 _COLUMNS: tuple[str, ...] = (
     "run", "RE [deg]", "TE [units]", "TE [%]", "centres [%]", "PSNR [dB]", "SSIM", "LPIPS", "train [s]",
 )  # fmt: skip
 
 
-def progress_bar() -> OnProgress:
-    """A callback for `run` that draws a bar on stderr for each training."""
+def describe_step(extent: float, loss: float, rotation_deg: float, translation: float) -> dict[str, str]:
+    """Where a training is, in words.
 
-    def describe(progress: Progress) -> dict[str, str]:
-        off = f"{progress.rotation_deg:.2f} deg {100 * progress.translation / progress.extent:.2f}%"
-        psnr = f"{-10 * math.log10(progress.loss):.2f} dB"
-        return {"loss": f"{progress.loss:.5f}", "PSNR": psnr, "off": off}
+    Args:
+        extent: largest distance between true cameras [scene units].
+        loss: mean squared colour error.
+        rotation_deg: mean rotation error [deg].
+        translation: mean translation error [scene units].
 
-    return training_loop.progress_bar(describe)
+    Returns:
+        The words by their names.
+    """
+    off = f"{rotation_deg:.2f} deg {100 * translation / extent:.2f}%"
+    return {"loss": f"{loss:.5f}", "PSNR": f"{-10 * math.log10(loss):.2f} dB", "off": off}
 
 
 def table(runs: dict[str, dict[str, Any]]) -> str:
@@ -49,8 +52,8 @@ def report(folder: Path, results: dict[str, Any]) -> str:
     one = next(iter(runs.values()))
     data, training, start, protocol = one["data"], one["training"], one["start"], one["protocol"]
     width, height = data["size"]
-    smoke = "  SMOKE RUN, the numbers mean nothing" if results["smoke"] else ""
-    settled = {label: run["settled"] for label, run in runs.items() if run["settled"]}
+    smoke = SMOKE if results["smoke"] else ""
+    refined = {label: run["test_time_refined"] for label, run in runs.items() if run["test_time_refined"]}
     lines = [
         f"noisy_nerf: {data['data']}, {data['images']} views of {width}x{height}, "
         f"preset {training['preset']}, {training['steps']} steps of {training['rays']} rays x "
@@ -66,14 +69,13 @@ def report(folder: Path, results: dict[str, Any]) -> str:
         f"  TE           {protocol['translation_error']}; in percent of the cameras' extent, "
         f"{data['extent']:.3g}",
         f"  alignment    {protocol['alignment']}",
-        f"  PSNR ...     {protocol['psnr, ssim, lpips']}",
+        f"  PSNR ...     {protocol['image_metrics']}",
         *(
-            f"  settled      {label}: PSNR {run['psnr']:.2f} dB, SSIM {run['ssim']:.3f}, "
+            f"  refined      {label}: PSNR {run['psnr']:.2f} dB, SSIM {run['ssim']:.3f}, "
             f"LPIPS {number(run['lpips'], 3)}"
-            for label, run in settled.items()
+            for label, run in refined.items()
         ),
-        f"  cost         {results['wall_s']:.0f} s in all, "
-        f"{results['peak_rss_bytes'] / 2**30:.2f} GiB of memory at most",
+        f"  cost         {cost_text(results)}",
         f"  written to   {folder}",
     ]
     return "\n".join(lines)

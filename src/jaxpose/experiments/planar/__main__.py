@@ -1,5 +1,6 @@
 """`python -m jaxpose.experiments.planar`."""
 
-from jaxpose.experiments.planar.pipeline import main
+from jaxpose.experiments.command import start
 
-main()
+if __name__ == "__main__":
+    start("jaxpose.experiments.planar.pipeline")

@@ -78,7 +78,7 @@ def aligner(photo: Photo, image: ImageField, warps: Warps, *, steps: int, points
         value, gradient = jax.value_and_grad(loss)(params, jnp.asarray(grid, rgb.dtype)[chosen], seen)
         with jax.numpy_dtype_promotion("standard"):  # optax needs it
             direction, memory = adam.update(gradient, state.adam)
-        rates = _RATE, jax.tree.map(lambda rate: rate * warps.fall**progress, warps.rates)
+        rates = _RATE, jax.tree.map(lambda rate: rate * warps.decay**progress, warps.rates)
         rates = jax.tree.broadcast(rates, params)
         new_image, pose = jax.tree.map(lambda p, rate, d: p - rate * d, params, rates, direction)
         if warps.reset is not None:

@@ -1,12 +1,11 @@
-"""What the planar experiment says: a bar while it runs, then numbers with their protocol."""
+"""What the planar experiment prints: numbers with their protocol."""
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from jaxpose.experiments.command import markdown_table, number, step_bar
+from jaxpose.experiments.outcome import SMOKE, cost_text, markdown_table, number
 from jaxpose.experiments.planar.task import PATCHES, PROTOCOL, Photo
 from jaxpose.experiments.planar.warps import RESET_EVERY, SPLINE_KNOTS, Warps
 
@@ -22,30 +21,6 @@ _COLUMNS: tuple[str, ...] = (
 )
 
 
-class Progress(NamedTuple):
-    """Where a run is: after `step` of `steps` of a motion with a pose field."""
-
-    pose: str
-    motion: int
-    motions: int
-    step: int
-    steps: int
-    loss: float
-    corner_px: float  # mean corner error
-
-
-def progress_bar() -> Callable[[Progress], None]:
-    """A callback for `run` that draws a bar on stderr for each motion."""
-    bar = step_bar()
-
-    def on_progress(progress: Progress) -> None:
-        name = f"{progress.pose} {progress.motion + 1}/{progress.motions}"
-        state = {"loss": f"{progress.loss:.5f}", "corners": f"{progress.corner_px:.2f} px"}
-        bar(name, progress.step, progress.steps, state)
-
-    return on_progress
-
-
 def protocol(setup: str, photo: Photo, path: Path, steps: int, points: int, warps: Warps) -> dict[str, Any]:
     """How the numbers of a run came about, in words and numbers."""
     height, width = photo.rgb.shape[:2]
@@ -58,17 +33,16 @@ def protocol(setup: str, photo: Photo, path: Path, steps: int, points: int, warp
         "patch_px": photo.crop,
         "motions": PROTOCOL[setup],
         "start": "the identity, that is the centre crop, for all patches",
-        "gauge": "patch 0 is the centre crop in ground truth and in the estimate, the others are "
+        "reference_frame": "patch 0 is the centre crop in ground truth and in the estimate, the others are "
         "relative to it",
-        "corner_error": "distance of the four warped corners from ground truth, mean over corners "
-        "and over all "
-        "patches but patch 0, whose error is zero by construction; no alignment afterwards",
+        "corner_error": "distance of the four warped corners from ground truth, mean over corners and over "
+        "all patches but patch 0, whose error is zero by construction; no alignment afterwards",
         "success": f"corner error below {SUCCESS_PX:g} px",
         "psnr": "of all pixels of all patches, patch 0 included",
         "steps": steps,
         "points_per_patch_and_step": points,
         "rates": rates | {"image": 1e-3},
-        "pose_rates_fall_to": warps.fall,
+        "pose_rates_decay_to": warps.decay,
         "reset": "none" if warps.reset is None else reset,
     }
 
@@ -111,10 +85,9 @@ def report(folder: Path, results: dict[str, Any]) -> str:
     one = next(iter(by_field.values()))
     about = one["protocol"]
     width, height = about["size"]
-    smoke = "  SMOKE RUN, the numbers mean nothing" if results["smoke"] else ""
+    smoke = SMOKE if results["smoke"] else ""
     start = one["start_corner_error_px"]
     patches = f"{about['patches']} patches of {about['patch_px']} px"
-    cost = f"{results['wall_s']:.0f} s in all, {results['peak_rss_bytes'] / 2**30:.2f} GiB of memory at most"
     return "\n".join([
         f"planar: {about['image']} {width}x{height}, {one['setup']} set-up, {patches}, "
         f"{len(one['motions'])} motions, {about['steps']} steps, seed {results['seed']}{smoke}",
@@ -126,7 +99,7 @@ def report(folder: Path, results: dict[str, Any]) -> str:
         f"{number(start['max'], 1)}",
         f"  success      {about['success']}",
         f"  PSNR         {about['psnr']}",
-        f"  cost         {cost}; s / motion: median",
+        f"  cost         {cost_text(results)}; s / motion: median",
         f"  written to   {folder}",
     ])  # fmt: skip
 

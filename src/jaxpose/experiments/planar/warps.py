@@ -12,10 +12,10 @@ from scipy.interpolate import CubicSpline
 from jaxpose import fields
 from jaxpose.fields import Params, PoseNetConfig
 
-Pose = Literal["posenet", "table", "spline_reset", "bspline"]
+Pose = Literal["posenet", "per_frame", "spline_reset", "bspline"]
 SPLINE_KNOTS = 5  # of both splines, ends included
 RESET_EVERY = 100  # steps
-_BARF = 1e-3  # Adam's rate of a table, BARF's
+_BARF = 1e-3  # Adam's rate of per-frame poses, BARF's
 _SERIES = 12  # terms of the matrix exponential after the identity; BARF keeps 10
 
 
@@ -28,33 +28,36 @@ class Warps(NamedTuple):
     init: Callable[[PRNGKeyArray], Params]
     warps: Callable[[Params], Float[Array, "n 3 3"]]
     rates: Any  # Adam's at the start, a prefix of the parameters
-    fall: float  # of the rates, exponential, over the whole run; 1: constant
-    reset: Float[np.ndarray, "n n"] | None = None  # what the table is multiplied by every RESET_EVERY steps
+    decay: float  # of the rates, exponential, over the whole run; 1: constant
+    reset: Float[np.ndarray, "n n"] | None = (
+        None  # what per-frame poses are multiplied by every RESET_EVERY steps
+    )
 
 
 def motion_warps(pose: Pose, patches: int, net: PoseNetConfig) -> Warps:
     """SE(2) motions from a pose field on SE(3) (a PoseNet as `net` says), at equal steps from -1 to 1.
 
     Of a pose the translation in x and y counts, and the rotation about z nearest to its own. All warps are
-    relative to the first, which fixes the gauge; the table's first row stays zero, as BARF has it.
+    relative to the first, which fixes the reference frame; the first of per-frame poses stays zero, as BARF
+    has it.
     """
     timestamps = np.linspace(-1, 1, patches)
     if pose == "posenet":
-        # A third and a half of METHOD's rates for NeRF, with which the field may run out of the image.
-        field, rates, fall = fields.posenet(net), {"translation": 3e-4, "rotation": 1e-4}, 0.03
+        # A third and a half of the rates for NeRF, with which the field may run out of the image.
+        field, rates, decay = fields.posenet(net), {"translation": 3e-4, "rotation": 1e-4}, 0.03
     elif pose == "bspline":
-        field, rates, fall = fields.bspline((-1.0, 1.0), SPLINE_KNOTS - 1), _BARF, 0.03
+        field, rates, decay = fields.bspline((-1.0, 1.0), SPLINE_KNOTS - 1), _BARF, 0.03
     else:
-        field, rates, fall = fields.table(timestamps), _BARF, 0.03
+        field, rates, decay = fields.table(timestamps), _BARF, 0.03
 
     def warps(params):
-        if pose in ("table", "spline_reset"):
+        if pose in ("per_frame", "spline_reset"):
             params = params.at[0].set(0)
         times = jnp.asarray(timestamps, jax.tree.leaves(params)[0].dtype)
         return _since_first(planar(jax.vmap(field.pose, (None, 0))(params, times)))
 
     reset = spline_projection(patches, SPLINE_KNOTS) if pose == "spline_reset" else None
-    return Warps(field.init, warps, rates, fall, reset)
+    return Warps(field.init, warps, rates, decay, reset)
 
 
 def homography_warps(patches: int) -> Warps:

@@ -6,20 +6,27 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxpose.datasets.types import Recording
 from jaxpose.errors import DataError
-from jaxpose.evaluation import trajectory_error
+from jaxpose.evaluation import image_quality, trajectory_error
+from jaxpose.experiments.slam.map_rendering import VIEW_WIDTH, Renderer, evenly
 from jaxpose.fields import body_to_camera
 from jaxpose.fields.derivatives import motion
 from jaxpose.fields.intrinsic_motion import THRESHOLD, effective_dof
 from jaxpose.geometry import rigid
 from jaxpose.geometry.camera import angle_of_view
 from jaxpose.imu import Imu, remove_gravity
-from jaxpose.slam.pipeline import SlamResult
+from jaxpose.slam import SlamResult
 
 _MOST_READINGS = 4000  # compared with the field; more are thinned
+_MAP_FRAMES = 10  # of each kind that the map is measured at
+MAP_PROTOCOL = (
+    f"map rendered from estimated poses of at most {_MAP_FRAMES} frames of each kind, about {VIEW_WIDTH} px "
+    "wide; PSNR over pixels where it shows a surface, depth L1 where the frame has depth too; held out: "
+    "tracked, never mapped"
+)
 
 
 class Inertial(NamedTuple):
@@ -72,15 +79,15 @@ class Measured(NamedTuple):
         return found
 
 
-def cost(result: SlamResult) -> dict[str, Any]:
+def tracking_numbers(result: SlamResult) -> dict[str, Any]:
     """What tracking cost and how it went."""
     settled = result.frames.seconds[2:]  # the first two compile
     return {
         "frames": len(result.frames.lost),
         "frames_lost": int(result.frames.lost.sum()),
-        "lost": np.flatnonzero(result.frames.lost),
+        "lost_frames": np.flatnonzero(result.frames.lost),
         "frames_uncertain": int(result.frames.uncertain.sum()),
-        "uncertain": np.flatnonzero(result.frames.uncertain),
+        "uncertain_frames": np.flatnonzero(result.frames.uncertain),
         "pose_sigma_median": _medians(result.frames.sigma),
         "seconds_per_frame": float(np.median(settled)),
         "seconds_per_frame_mean_with_compilation": float(result.frames.seconds.mean()),
@@ -125,7 +132,7 @@ def accuracy(
         "ate_rmse_m": ate.rmse,
         "ate_max_m": ate.max,
         "rotation_rmse_deg": trajectory_error.statistics(rotation_deg).rmse,
-        "frames_with_truth": ate.frames,
+        "frames_with_ground_truth": ate.frames,
         "rpe": _drift(result.T_world_cam, T_world_true),
         "field_ate_rmse_m": trajectory_error.ate(field_poses, T_world_true).rmse,
     }
@@ -172,3 +179,28 @@ def inertial(recording: Recording, result: SlamResult) -> Inertial | None:
     gyro, accelerometer = (read_omega, omega), (read, field)
     rms = [float(np.sqrt(np.mean((a - b) ** 2))) for a, b in (gyro, accelerometer)]
     return Inertial(t, gyro, accelerometer, *rms)
+
+
+def map_quality(result: SlamResult, render: Renderer) -> dict[str, Any]:
+    """PSNR [dB] and mean depth error [m] of the map at mapped and at held-out frames; None without such."""
+    kinds = {
+        "mapped": result.frames.mapped & ~result.frames.lost,
+        "held_out": ~result.frames.mapped & ~result.frames.lost,
+    }
+    return {"protocol": MAP_PROTOCOL} | {kind: _quality(render, chosen) for kind, chosen in kinds.items()}
+
+
+def _quality(render: Renderer, chosen: Bool[np.ndarray, " n"]) -> dict[str, Any] | None:
+    rows = []
+    for i in evenly(np.flatnonzero(chosen), _MAP_FRAMES):
+        seen = render(i)
+        there = seen.depth > 0
+        both = there & (seen.frame_depth > 0)
+        if both.any():
+            psnr = image_quality.psnr(np.clip(seen.rgb[there], 0, 1), seen.frame_rgb[there])
+            error = np.abs(seen.depth - seen.frame_depth)[both].mean()
+            rows.append((psnr, error, both.sum() / max((seen.frame_depth > 0).sum(), 1)))
+    if not rows:
+        return None
+    psnr, error, share = np.mean(rows, axis=0)
+    return {"psnr": psnr, "depth_l1_m": error, "depth_coverage": share, "frames": len(rows)}

@@ -1,48 +1,34 @@
-"""What the SLAM experiments say on the terminal: a bar while they run, then numbers with their protocol."""
+"""What the SLAM experiments print: progress, then numbers with their protocol."""
 
 import math
-import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
-from jaxpose.experiments.command import markdown_table
+from jaxpose.experiments.outcome import SMOKE, cost_text, markdown_table
+from jaxpose.experiments.progress import Update
 from jaxpose.slam import ImuMode, Progress
 
 _COLUMNS: tuple[str, ...] = ("IMU", "ATE [cm]", "RPE [cm]", "RPE [deg]", "frames lost", "s / frame")
 
 
-def progress_bar() -> Callable[[ImuMode, Progress], None]:
-    """A callback for `run` that draws a bar on stderr for each tracked recording."""
-    bar: tqdm | None = None
-    lost = 0
+def tracking_update(mode: ImuMode, progress: Progress) -> Update:
+    """How far tracking is, in words.
 
-    def on_frame(mode: ImuMode, progress: Progress) -> None:
-        nonlocal bar, lost
-        if bar is None:  # a resumed run begins at a later frame
-            bar = tqdm(
-                total=progress.count,
-                initial=progress.index,
-                desc=f"IMU {mode}",
-                unit="frame",
-                file=sys.stderr,
-            )
-            lost = int(progress.state.frames.lost[: progress.index].sum())
-        frames = progress.state.frames
-        lost += bool(frames.lost[progress.index])
-        loss = float(frames.loss[progress.index])
-        state = {"loss": f"{loss:.2f}"} if math.isfinite(loss) else {}  # the first frame has none
-        if math.isfinite(progress.ground_truth_error):
-            state["off"] = f"{100 * progress.ground_truth_error:.1f} cm"
-        bar.set_postfix(state | {"lost": str(lost)}, refresh=False)
-        bar.update()
-        if progress.index == progress.count - 1:
-            bar.close()
-            bar = None
+    Args:
+        mode: of the IMU.
+        progress: the frame that was tracked.
 
-    return on_frame
+    Returns:
+        The update to show.
+    """
+    frames = progress.state.frames
+    loss = float(frames.loss[progress.index])
+    state = {"loss": f"{loss:.2f}"} if math.isfinite(loss) else {}  # the first frame has none
+    if math.isfinite(progress.ground_truth_error):
+        state["off"] = f"{100 * progress.ground_truth_error:.1f} cm"
+    state["lost"] = str(int(frames.lost[: progress.index + 1].sum()))
+    return Update(f"tracking, IMU {mode}", progress.index + 1, progress.count, "frames", state)
 
 
 def table(by_mode: dict[str, dict[str, Any]]) -> str:
@@ -75,7 +61,7 @@ def report(folder: Path, results: dict[str, Any]) -> str:
     if results["imu"]["mode"] != "none":
         lines.append(_line("IMU readings", results["imu"]["readings"]))
     if "ate_rmse_m" in results:
-        lines += _against_truth(results)
+        lines += _against_ground_truth(results)
     else:
         lines.append(_line("ATE", "no ground truth to compare with"))
     lines += [
@@ -110,16 +96,16 @@ def report(folder: Path, results: dict[str, Any]) -> str:
 def _heading(results: dict[str, Any], imu: str) -> str:
     data = results["data"]
     width, height = data["size"]
-    smoke = "  SMOKE RUN, the numbers mean nothing" if results["smoke"] else ""
+    smoke = SMOKE if results["smoke"] else ""
     return (
         f"{results['experiment']}: {data['name']}, {results['frames']} frames of {width}x{height} at "
-        f"{data['rate_hz']:.3g} Hz, {imu}, frame {results['frame_of_reference']}, "
+        f"{data['rate_hz']:.3g} Hz, {imu}, frame {results['reference_frame']}, "
         f"seed {results['seed']}{smoke}"
     )
 
 
-def _against_truth(results: dict[str, Any]) -> list[str]:
-    used = f"{results['frames_with_truth']} of {results['frames']} frames"
+def _against_ground_truth(results: dict[str, Any]) -> list[str]:
+    used = f"{results['frames_with_ground_truth']} of {results['frames']} frames"
     lines = [
         _line(
             "ATE-RMSE",
@@ -147,7 +133,7 @@ def _map(quality: dict[str, Any]) -> list[str]:
     for kind, name in (("mapped", "mapped frames"), ("held_out", "held-out frames")):
         numbers = quality[kind]
         if numbers is not None:
-            depth, share = _cm(numbers["depth_l1_m"]), f"{numbers['share_of_depth_shown']:.1%}"
+            depth, share = _cm(numbers["depth_l1_m"]), f"{numbers['depth_coverage']:.1%}"
             words.append(
                 f"{numbers['psnr']:.2f} dB, depth L1 {depth} cm over {share} of the depth at "
                 f"{numbers['frames']} {name}"
@@ -158,8 +144,7 @@ def _map(quality: dict[str, Any]) -> list[str]:
 
 
 def _ending(folder: Path, results: dict[str, Any], notes: Sequence[str], picture: str) -> list[str]:
-    cost = f"{results['wall_s']:.0f} s in all, {results['peak_rss_bytes'] / 2**30:.2f} GiB of memory at most"
-    lines = [_line("cost", cost), *(_line("note", note) for note in notes)]
+    lines = [_line("cost", cost_text(results)), *(_line("note", note) for note in notes)]
     pictures = sorted(str(path.relative_to(folder)) for path in folder.glob("*.png"))
     return [*lines, _line("pictures", ", ".join(pictures) or picture), _line("written to", str(folder))]
 

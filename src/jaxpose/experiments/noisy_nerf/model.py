@@ -45,19 +45,19 @@ _NET_RATES = {
     "noisy": ((3e-4, 2e-5), (3e-4, 2e-5)),
     "unknown": ((6e-4, 4e-5), (2e-3, 1e-4)),
 }
-_TABLE_RATES = {  # also of splines; with preset paper BARF's
+_PER_FRAME_RATES = {  # also of splines; with preset paper BARF's
     "noisy": ((3e-3, 1e-4), (3e-3, 1e-4)),
     "unknown": ((2e-3, 1e-4), (6e-3, 3e-4)),
 }
 _BARF_SETTLE = {"depth": 1e-3, "disparity": 3e-3}  # BARF's rate of test-time poses, Blender and LLFF
 
 
-class Setup(NamedTuple):
+class Model(NamedTuple):
     """A scene and a pose field (camera-to-world), and how to train them."""
 
     scene: SceneField
     field: PoseField
-    factors: Callable[[Params], tuple[Factor, ...]]  # of the field, for `io_field.write_field`
+    factors: Callable[[Params], tuple[Factor, ...]]  # of the field, for `serialization.write_field`
     scene_rates: Rate
     pose_rates: Any
     train: TrainConfig
@@ -67,7 +67,7 @@ class Setup(NamedTuple):
     settle_rate: float
 
 
-def build(config: Config, problem: Problem) -> Setup:
+def build(config: Config, problem: Problem) -> Model:
     """Scene, pose field and rates that the config names, for these photographs."""
     photographs, paper = problem.train, config.preset == "paper"
     barf = photographs.spacing
@@ -87,7 +87,7 @@ def build(config: Config, problem: Problem) -> Setup:
     world = config.side == "world"
     field = fields.refine(field, fields.piecewise_geodesic(t, T_start), side="world" if world else "body")
     depths = Depths(photographs.near, photographs.far, photographs.spacing)
-    return Setup(
+    return Model(
         scene,
         field,
         lambda params: (factor(params), start) if world else (start, factor(params)),
@@ -104,7 +104,7 @@ def build(config: Config, problem: Problem) -> Setup:
 def splined(
     params: Float[Array, "n 6"], t: Float[np.ndarray, " n"], knots: int, smoothing: float
 ) -> Float[Array, "n 6"]:
-    """A table reset to scipy's cubic smoothing spline of each of its six columns, the paper's "B-spline".
+    """Per-frame poses reset to scipy's cubic smoothing spline of each column, the paper's "B-spline".
 
     The spline has the fewest knots, and at most `knots` inside the span, with which its squared residuals sum
     up to `smoothing`; where that many do not reach it, they are all used.
@@ -121,9 +121,9 @@ def splined(
     return jnp.asarray(np.stack(columns, axis=-1), params.dtype)
 
 
-def describe(config: Config, setup: Setup) -> dict[str, Any]:
+def describe(config: Config, model: Model) -> dict[str, Any]:
     """The settings of a training, in words and numbers."""
-    train = asdict(setup.train)
+    train = asdict(model.train)
     del train["chunk"]
     plain = lambda rates: jax.tree.map(
         lambda rate: [np.unique(part).tolist() for part in rate],
@@ -138,7 +138,7 @@ def describe(config: Config, setup: Setup) -> dict[str, Any]:
         "net": asdict(config.net) if config.pose == "posenet" else None,
         "spline_knots": config.spline_knots if "spline" in config.pose else None,
         "spline_smoothing": config.spline_smoothing if config.pose == "spline_reset" else None,
-        "rates": {"first, last, start": {"scene": plain(setup.scene_rates), "pose": plain(setup.pose_rates)}},
+        "rates": {"first_last_start": {"scene": plain(model.scene_rates), "pose": plain(model.pose_rates)}},
     }
 
 
@@ -164,7 +164,7 @@ def _field(config: Config, problem: Problem) -> tuple[PoseField, Callable[[Param
     if paper:
         shift = turn = (3e-3 if photographs.spacing == "disparity" else 1e-3, 1e-5)
     else:
-        shift, turn = _TABLE_RATES[start]
+        shift, turn = _PER_FRAME_RATES[start]
     if config.pose == "bspline":
         field, columns = fields.bspline(span, config.spline_knots), (3, 4)
         factor = partial(bspline_factor, span)

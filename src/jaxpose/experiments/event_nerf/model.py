@@ -46,19 +46,19 @@ _FAST_PRESETS = {
 }
 
 
-class Setup(NamedTuple):
+class Model(NamedTuple):
     """A scene and a pose field (camera-to-world), and how to train them."""
 
     scene: SceneField
     field: PoseField
-    factors: Callable[[Params], tuple[Factor, ...]]  # of the field, for `io_field.write_field`
+    factors: Callable[[Params], tuple[Factor, ...]]  # of the field, for `serialization.write_field`
     rates: dict[str, Rate]  # of the scene and, where it moves, of the parts of the pose field
     train: EventTrainConfig
     trainer: Trainer
     data: EventData
 
 
-def build(config: Config, problem: Problem) -> Setup:
+def build(config: Config, problem: Problem) -> Model:
     """Scene, pose field, rates and data that the config names, for these events."""
     recording, paper = problem.recording, config.preset == "paper"
     plan = _preset(config, problem)
@@ -82,7 +82,7 @@ def build(config: Config, problem: Problem) -> Setup:
     trainer = event_training.trainer(
         scene, field, recording.camera, problem.depths, span, scene_rate, pose_rates, train
     )  # fmt: skip
-    return Setup(
+    return Model(
         scene,
         field,
         factors,
@@ -93,16 +93,16 @@ def build(config: Config, problem: Problem) -> Setup:
     )
 
 
-def describe(config: Config, setup: Setup) -> dict[str, Any]:
+def describe(config: Config, model: Model) -> dict[str, Any]:
     """The settings of a training, in words and numbers."""
-    train = asdict(setup.train)
+    train = asdict(model.train)
     del train["chunk"]
     return {
         "pose": config.pose,
         "preset": config.preset,
         **train,
         "net": asdict(config.net) if config.pose == "posenet" else None,
-        "rates": {"first, last, start": {name: list(rate) for name, rate in setup.rates.items()}},
+        "rates": {"first_last_start": {name: list(rate) for name, rate in model.rates.items()}},
     }
 
 

@@ -1,40 +1,25 @@
-"""A map seen from poses: pictures of it, how well it shows what was measured, and its file."""
+"""A map rendered from poses of its camera."""
 
-import zipfile
 from collections.abc import Callable
-from dataclasses import asdict
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, UInt8
+from jaxtyping import Array, Float, Int, UInt8
 
 from jaxpose.datasets.types import Recording
-from jaxpose.errors import DataError
-from jaxpose.evaluation import image_quality
-from jaxpose.files import atomic
 from jaxpose.geometry import se3
 from jaxpose.geometry.camera import Camera, unproject
 from jaxpose.plots.slam import View
 from jaxpose.scenes import GridConfig, SceneField
-from jaxpose.slam.map.texture import Texture
+from jaxpose.slam import SlamResult
 from jaxpose.slam.observation import Pixels, SampleConfig, render_pixels
-from jaxpose.slam.pipeline import SlamResult
 
-_VIEW_WIDTH = 160  # [px] of rendered pictures, about
+VIEW_WIDTH = 160  # [px] of rendered pictures, about
 _VIEWS = 4
-_MEASURED = 10  # frames of each kind
 _CHUNK = 4800  # rays rendered in one call
-_VERSION = 2  # of map.npz
-
-PROTOCOL = (
-    f"map rendered from estimated poses of at most {_MEASURED} frames of each kind, about {_VIEW_WIDTH} px "
-    "wide; PSNR over pixels where it shows a surface, depth L1 where the frame has depth too; held out: "
-    "tracked, never mapped"
-)
 
 
 class Rendered(NamedTuple):
@@ -57,15 +42,6 @@ Viewer = Callable[
 ]
 
 
-class SavedMap(NamedTuple):
-    """A map as a run folder keeps it, `map.npz`."""
-
-    grid: GridConfig
-    values: Float[np.ndarray, "x y z 4"]  # of the finest level: signed distance [m], red, green, blue
-    texture: Texture  # finer colour on the surface
-    keyframes: Int[np.ndarray, " k"]  # frames, counted from the first of the trajectory
-
-
 def views(recording: Recording, result: SlamResult, render: Renderer) -> list[View]:
     """A few frames, evenly over the recording, beside the map rendered from their estimated poses."""
 
@@ -75,38 +51,13 @@ def views(recording: Recording, result: SlamResult, render: Renderer) -> list[Vi
         label = f"t = {recording.t[i]:.2f} s{lost}"
         return View(label, seen.photograph, seen.rgb, seen.frame_depth, seen.depth)
 
-    return [view(i) for i in _evenly(np.arange(len(recording.t)), _VIEWS)]
-
-
-def map_quality(result: SlamResult, render: Renderer) -> dict[str, Any]:
-    """PSNR [dB] and mean depth error [m] of the map at mapped and at held-out frames; None without such."""
-    kinds = {
-        "mapped": result.frames.mapped & ~result.frames.lost,
-        "held_out": ~result.frames.mapped & ~result.frames.lost,
-    }
-    return {"protocol": PROTOCOL} | {kind: _quality(render, chosen) for kind, chosen in kinds.items()}
-
-
-def _quality(render: Renderer, chosen: Bool[np.ndarray, " n"]) -> dict[str, Any] | None:
-    rows = []
-    for i in _evenly(np.flatnonzero(chosen), _MEASURED):
-        seen = render(i)
-        there = seen.depth > 0
-        both = there & (seen.frame_depth > 0)
-        if both.any():
-            psnr = image_quality.psnr(np.clip(seen.rgb[there], 0, 1), seen.frame_rgb[there])
-            error = np.abs(seen.depth - seen.frame_depth)[both].mean()
-            rows.append((psnr, error, both.sum() / max((seen.frame_depth > 0).sum(), 1)))
-    if not rows:
-        return None
-    psnr, error, share = np.mean(rows, axis=0)
-    return {"psnr": psnr, "depth_l1_m": error, "share_of_depth_shown": share, "frames": len(rows)}
+    return [view(i) for i in evenly(np.arange(len(recording.t)), _VIEWS)]
 
 
 def renderer(recording: Recording, result: SlamResult) -> Renderer:
     """The frame with a given index, and the map as seen from its estimated pose."""
     look = viewer(result.scene, result.grid, recording.camera)
-    pixels = every(recording.camera, _VIEW_WIDTH)
+    pixels = every(recording.camera, VIEW_WIDTH)
     column, row = np.moveaxis(pixels, -1, 0)
 
     def at(i: int) -> Rendered:
@@ -169,31 +120,7 @@ def every(camera: Camera, width: int) -> Int[np.ndarray, "h w 2"]:
     return np.stack([column, row], axis=-1)
 
 
-def write_map(path: Path | str, saved: SavedMap) -> None:
-    """Write a map (npz, compressed): version, the fields of its `GridConfig`, values, paint, keyframes."""
-    arrays = asdict(saved.grid) | {"values": saved.values, "keyframes": saved.keyframes}
-    arrays |= {f"paint_{name}": array for name, array in saved.texture._asdict().items()}
-    with atomic.atomic(path) as temporary:
-        np.savez_compressed(temporary, allow_pickle=False, version=_VERSION, **arrays)
-
-
-def read_map(path: Path | str) -> SavedMap:
-    """Read what `write_map` wrote; DataError naming the file for what is not that."""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            content = dict(file)
-        if content["version"] != _VERSION:
-            raise DataError(f"{path}: expected a map of version {_VERSION}, got {content['version']}")
-        lower, upper = (tuple(content[name].tolist()) for name in ("lower", "upper"))
-        voxel, truncation = float(content["voxel"]), float(content["truncation"])
-        config = GridConfig(lower, upper, voxel, int(content["levels"]), truncation)
-        texture = Texture(content["paint_slot"], content["paint_tiles"])
-        return SavedMap(config, content["values"], texture, content["keyframes"])
-    except (zipfile.BadZipFile, ValueError, KeyError, EOFError) as error:
-        raise DataError(f"{path}: expected a map, got {' '.join(str(error).split())}") from None
-
-
-def _evenly(indices: Int[np.ndarray, " n"], most: int) -> list[int]:
+def evenly(indices: Int[np.ndarray, " n"], most: int) -> list[int]:
     """Some of the indices, the first and the last among them."""
     places = np.linspace(0, len(indices) - 1, min(most, len(indices)))
     return [int(indices[round(place)]) for place in places]

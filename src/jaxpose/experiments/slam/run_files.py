@@ -1,0 +1,159 @@
+"""The files of a SLAM run: trajectory, field, map, point cloud, mesh, pictures."""
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxpose.datasets.types import Recording
+from jaxpose.errors import DataError
+from jaxpose.experiments.progress import OnUpdate, Update
+from jaxpose.experiments.slam.evaluation import (
+    Measured,
+    accuracy,
+    freedom,
+    inertial,
+    map_quality,
+    tracking_numbers,
+)
+from jaxpose.experiments.slam.map_file import SavedMap, write_map
+from jaxpose.experiments.slam.map_rendering import Renderer, renderer, views
+from jaxpose.experiments.slam.options import Options
+from jaxpose.experiments.slam.source import Source
+from jaxpose.fields import Params, PoseField, bspline
+from jaxpose.fields.serialization import bspline_factor, write_field
+from jaxpose.files import atomic, trajectories
+from jaxpose.files.camera_json import write_camera
+from jaxpose.files.ply import write_ply
+from jaxpose.plots import slam as slam_plots
+from jaxpose.slam import SlamResult
+from jaxpose.slam.initial_pose import first_pose
+from jaxpose.slam.keyframes import keyframe_images
+from jaxpose.slam.map.mesh import mesh, point_cloud
+
+
+def write_run(
+    folder: Path, options: Options, source: Source, result: SlamResult, on_update: OnUpdate
+) -> tuple[dict[str, Any], Float[np.ndarray, " n"]]:
+    """Measure a tracked recording and write all of its files but `results.json`.
+
+    Args:
+        folder: the run folder.
+        options: the settings of the run.
+        source: the recording.
+        result: how it was tracked.
+        on_update: called with what is done.
+
+    Returns:
+        What was measured, for the results, and the translation error [m] of every frame, NaN without ground
+        truth.
+    """
+    recording, ground_truth = source.recording, source.recording.T_world_cam
+    on_update(Update("measuring the trajectory"))
+    errors = None if ground_truth is None else accuracy(result, recording.t, ground_truth)
+    measured = Measured(errors, inertial(recording, result), freedom(recording, result))
+    _write_trajectory(folder, recording, result)
+    on_update(Update("writing the map"))
+    values, texture = jax.tree.map(np.asarray, result.scene_params)
+    write_map(folder / "map.npz", SavedMap(result.grid, values, texture, result.keyframes))
+    images_folder = "." if options.data is None else options.data.resolve()
+    write_camera(folder / "camera.json", recording.camera, recording.files, images_folder)
+    atomic.write_json(folder / "config.json", options)
+    on_update(Update("writing the point cloud and the mesh"))
+    notes = (*recording.notes, *first_pose(recording).notes, *_write_surface(folder, recording, result))
+    on_update(Update("rendering the map"))
+    render = renderer(recording, result)
+    quality = map_quality(result, render)
+    on_update(Update("drawing figures"))
+    _draw(folder, f"{recording.name}, IMU {options.slam.imu}", recording, result, render, measured)
+    found = {**tracking_numbers(result), **measured.numbers(), "map": quality, "notes": notes}
+    return found, np.full(len(recording.t), np.nan) if errors is None else errors.translation_m
+
+
+def load_field(folder: Path | str) -> tuple[PoseField, Params]:
+    """The continuous trajectory of a run.
+
+    Args:
+        folder: its run folder.
+
+    Returns:
+        A field and its parameters: `field.pose(params, t)` is T_world_cam at `t` [s], on the clock of
+        `trajectory.txt`, between its first and last time.
+
+    Raises:
+        DataError: for the folder of no SLAM run, or of one of before version 1 of `field.npz`.
+    """
+    path = Path(folder) / "field.npz"
+    with np.load(path) as file:
+        if "0.control_points" not in file:
+            raise DataError(f"{path}: expected a B-spline in a trajectory of version 1, got neither")
+        params, (first, last) = jnp.asarray(file["0.control_points"], jnp.float32), file["0.span"]
+    return bspline((float(first), float(last)), params.shape[0] - 3), params
+
+
+def _write_trajectory(folder: Path, recording: Recording, result: SlamResult) -> None:
+    """The poses of the frames, the ground truth, and the continuous trajectory."""
+    t, ground_truth = recording.t, recording.T_world_cam
+    trajectories.write_tum(folder / "trajectory.txt", trajectories.Trajectory(t, result.T_world_cam))
+    if ground_truth is not None:
+        trajectories.write_tum(folder / "reference.txt", trajectories.Trajectory(t, ground_truth))
+    span = (0.0, float(t[-1] - t[0]))
+    write_field(folder / "field.npz", span, [bspline_factor(span, result.field_params)])
+
+
+def _write_surface(folder: Path, recording: Recording, result: SlamResult) -> tuple[str, ...]:
+    """The map as a point cloud and, where scikit-image is installed, as a mesh; a note where it is not."""
+    keyframes = partial(keyframe_images, recording.read, result.keyframes, result.T_world_cam)
+    points = point_cloud(keyframes(), recording.camera, result.grid.voxel)
+    write_ply(folder / "points.ply", points.points, points.rgb)
+    try:
+        values, _ = result.scene_params
+        surface = mesh(result.grid, np.asarray(values), keyframes(), recording.camera)
+    except ImportError:
+        return ('no mesh.ply: pip install "jaxpose[mesh]" for marching cubes',)
+    write_ply(folder / "mesh.ply", surface.points, surface.rgb, surface.faces)
+    return ()
+
+
+def _draw(
+    folder: Path,
+    name: str,
+    recording: Recording,
+    result: SlamResult,
+    render: Renderer,
+    measured: Measured,
+) -> None:
+    """The pictures of a run, poses aligned as their errors are."""
+    errors, motion, freed = measured
+    name = f"{name}, {len(recording.t)} frames"
+    if errors is None:
+        title = f"{name}: no ground truth to compare with"
+        slam_plots.trajectory(folder / "trajectory.png", result.T_world_cam, None, result.frames.lost, title)
+    else:
+        ate = f"{name}: ATE-RMSE {100 * errors.numbers['ate_rmse_m']:.2f} cm after SE(3) alignment"
+        slam_plots.trajectory(
+            folder / "trajectory.png", errors.aligned, recording.T_world_cam, result.frames.lost, ate
+        )
+        slam_plots.errors(
+            folder / "errors.png",
+            recording.t,
+            errors.translation_m,
+            errors.rotation_deg,
+            result.frames.lost,
+            ate,
+        )
+    slam_plots.renders(
+        folder / "renders.png",
+        views(recording, result, render),
+        f"{name}: the map seen from the estimated poses",
+    )
+    if motion is not None:
+        title = f"{name}: IMU against the derivatives of the final field"
+        slam_plots.inertial(folder / "inertial.png", motion.t, motion.gyro, motion.accelerometer, title)
+    if freed is not None:
+        title = f"{recording.name}: motion from frame to frame, before and in the intrinsic frame"
+        slam_plots.freedom(folder / "freedom.png", recording.t[1:], freed.before, freed.after, title)
