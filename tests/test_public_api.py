@@ -6,7 +6,11 @@ import pkgutil
 import subprocess
 import sys
 import types
+from functools import partial
 
+import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
 
 import jaxpose
@@ -71,3 +75,84 @@ def test_the_names_resolve_all_at_once():
 
 def test_the_version_is_that_of_the_distribution():
     assert importlib.metadata.version("jaxpose") == jaxpose.__version__
+
+
+# What users make of the public names, fifteen lines each at most.
+
+TURNING = jnp.array([0.3, 0.0, 0.1, 0.0, 0.0, 0.4])  # a twist: 0.4 rad/s about z
+
+
+def test_a_trajectory_is_fitted_and_asked_a_thousand_times():
+    times = jnp.linspace(0.0, 2.0, 41)
+    poses = jaxpose.se3.exp(jnp.outer(times, TURNING))
+    field = jaxpose.bspline((0.0, 2.0), intervals=8)
+    params = jaxpose.fit(field, times, poses, key=jax.random.key(0), learning_rate=3e-2).params
+    ask = jax.jit(jax.vmap(lambda params, t: jaxpose.motion(partial(field.pose, params), t), (None, 0)))
+    found = ask(params, jnp.linspace(0.0, 2.0, 1000))
+    expected = jaxpose.se3.exp(jnp.outer(jnp.linspace(0.0, 2.0, 1000), TURNING))
+    assert np.abs(found.pose - expected).max() < 1e-3
+    assert np.abs(found.omega_body - TURNING[None, 3:]).max() < 2e-2
+
+
+def test_a_ray_through_a_density_of_ones_own():
+    fog = lambda point, direction: (jnp.where(point[2] > 1, 2.0, 0.0), jnp.array([1.0, 0.5, 0.0]))
+    camera = jaxpose.Camera(50.0, 50.0, 15.5, 11.5, 32, 24)
+    ray = jaxpose.pixel_ray(camera, jnp.eye(4), jnp.array([15.5, 11.5]))
+    seen = jaxpose.render_ray(fog, ray, jnp.linspace(0.0, 6.0, 2001), weights=jaxpose.density_weights)
+    assert seen.depth == pytest.approx(1 + 1 / 2, abs=5e-3)  # Beer's law
+    assert np.allclose(seen.rgb, [1.0, 0.5, 0.0], atol=1e-3)
+
+
+@pytest.fixture(scope="module")
+def walk():
+    """Frames as arrays, on the clock of 2023, with their ground truth."""
+    room = jaxpose.datasets.synthetic.room(
+        jaxpose.datasets.synthetic.RoomConfig(duration_s=1.0, width=80, height=60)
+    )
+    rgb, depth = (np.stack(images) for images in zip(*(room.read(i) for i in range(6)), strict=True))
+    return room.camera, 1.7e9 + room.t[:6], rgb, depth, room.T_world_cam[:6]
+
+
+@pytest.fixture(scope="module")
+def tracked(walk):
+    camera, t, rgb, depth, _ = walk
+    recording = jaxpose.datasets.from_arrays(camera, t, rgb, depth)
+    return jaxpose.slam.run(recording, jaxpose.slam.SlamConfig(voxel=0.05))
+
+
+def test_slam_from_arrays(walk, tracked):
+    """Poses since the first one, and a continuous trajectory through them."""
+    *_, T_true = walk
+    moved = np.linalg.inv(T_true[0]) @ T_true[5]
+    found = np.linalg.inv(tracked.T_world_cam[0]) @ tracked.T_world_cam[5]
+    assert np.linalg.norm(found[:3, 3] - moved[:3, 3]) < 0.1 * np.linalg.norm(moved[:3, 3])
+    assert np.abs(found[:3, :3] - moved[:3, :3]).max() < 0.03
+    between = tracked.field.pose(tracked.field_params, jnp.float32(walk[1][5] - walk[1][0]))
+    assert np.abs(between - tracked.T_world_cam[5]).max() < 0.01
+
+
+def test_slam_on_frames_that_come_one_by_one(walk, tracked):
+    camera, times, colours, depths, _ = walk
+    state = jaxpose.slam.init(camera, jaxpose.slam.SlamConfig(voxel=0.05))
+    for t, rgb, depth in zip(times, colours, depths, strict=True):
+        state = jaxpose.slam.step(state, rgb, depth, t)
+    result = jaxpose.slam.finish(state)
+    assert np.abs(result.T_world_cam - tracked.T_world_cam).max() < 1e-4
+    assert result.field_rmse_m < 0.01
+
+
+def test_a_rolling_shutter_along_a_run(walk, tracked):
+    """Each row is seen from the pose at its own time."""
+    camera, depths, line_s = walk[0], jnp.linspace(0.2, 5.0, 200), 5e-4
+    query = partial(tracked.scene.query, tracked.scene_params)
+
+    def see(column, row, t):
+        T = tracked.field.pose(tracked.field_params, t)
+        ray = jaxpose.pixel_ray(camera, T, jnp.stack([column, row]))
+        return jaxpose.render_ray(query, ray, depths, weights=jaxpose.surface_weights(0.03)).depth
+
+    columns, rows = jnp.arange(0.0, 80, 8), jnp.arange(0.0, 60, 6)
+    image = jax.jit(jax.vmap(jax.vmap(see, (0, None, None)), (None, 0, 0)))
+    rolling, still = image(columns, rows, rows * line_s), image(columns, rows, 0 * rows)
+    assert np.nanmedian(np.abs(still - walk[3][0, ::6, ::8])) < 0.05
+    assert 1e-4 < np.nanmedian(np.abs(rolling - still)) < 0.05

@@ -10,6 +10,7 @@ from .types import Frame as Frame
 from .types import Photographs as Photographs
 from .types import Recording as Recording
 from .types import every as every
+from .types import from_arrays as from_arrays
 from .types import select as select
 from .types import take as take
 from .types import thin as thin

@@ -6,6 +6,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+from jaxpose._checks import check_increasing, check_shapes
 from jaxpose.errors import DataError
 from jaxpose.events import Events, Mosaic
 from jaxpose.geometry.camera import Camera
@@ -72,6 +73,61 @@ class EventRecording(NamedTuple):
     frames: Photographs | None = None  # the camera's own images on the same clock, where it takes any
     held_out: Photographs | None = None  # views to measure a reconstruction on
     notes: tuple[str, ...] = ()  # what the loader has to tell the user
+
+
+def from_arrays(
+    camera: Camera,
+    t: Float[np.ndarray, " n"],
+    rgb: UInt8[np.ndarray, "n h w 3"],
+    depth: Float[np.ndarray, "n h w"],
+    *,
+    name: str = "arrays",
+    T_world_cam: Float[np.ndarray, "n 4 4"] | None = None,
+    imu: Imu | None = None,
+    T_body_cam: Float[np.ndarray, "4 4"] | None = None,
+) -> Recording:
+    """A recording of frames that are in memory.
+
+    Args:
+        camera: Intrinsics of colour and depth, which are registered to each other.
+        t: Times of the frames [s], increasing, on any clock: the recording's begins at the first.
+        rgb: Colours.
+        depth: Depth along the optical axis [m]; 0 where there is none.
+        name: What reports call it.
+        T_world_cam: Ground truth, where it is known; rows of NaN where it is not.
+        imu: Readings on the clock of `t`: body rate [rad/s] and specific force [m/s^2], gravity in it.
+        T_body_cam: Camera to IMU; by default the IMU is where the camera is.
+
+    Returns:
+        A recording for `slam.run`.
+
+    Raises:
+        ValueError: For arrays of other shapes or types, and times that do not increase.
+    """
+    t, rgb, depth = np.asarray(t, np.float64), np.asarray(rgb), np.asarray(depth)
+    size = f"{camera.height} {camera.width}"
+    check_shapes(t=(t, "n"), rgb=(rgb, f"n {size} 3"), depth=(depth, f"n {size}"))
+    check_increasing(t=t)
+    if len(t) == 0:
+        raise ValueError("t: expected at least 1 frame, got none")
+    if rgb.dtype != np.uint8:
+        raise ValueError(f"rgb: expected uint8, got {rgb.dtype}")
+    if not np.issubdtype(depth.dtype, np.floating):
+        raise ValueError(f"depth: expected metres, floating point, got {depth.dtype}")
+    if T_world_cam is not None:
+        check_shapes(t=(t, "n"), T_world_cam=(T_world_cam, "n 4 4"))
+    if T_body_cam is not None:
+        check_shapes(T_body_cam=(T_body_cam, "4 4"))
+    return Recording(
+        name,
+        camera,
+        t - t[0],
+        lambda i: Frame(rgb[i], np.where(np.isfinite(depth[i]), depth[i], 0).astype(np.float32)),
+        T_world_cam=T_world_cam,
+        imu=None if imu is None else imu._replace(t=np.asarray(imu.t, np.float64) - t[0]),
+        T_body_cam=np.eye(4) if T_body_cam is None else T_body_cam,
+        t0=float(t[0]),
+    )
 
 
 def select(recording: Recording, indices: np.ndarray) -> Recording:
