@@ -140,16 +140,17 @@ def test_poses_that_are_unknown_or_outside(recordings):
     imu, at, poses = recordings[0]
     poses = poses.copy()
     poses[:40], poses[60:80] = np.nan, np.nan
-    found = filter_imu(imu, np.append(at, 30.0), np.append(poses, poses[-1:], axis=0), ADIS16448, POSE_NOISE)
-    assert (found.poses_used, found.poses_skipped) == (139, 61)
+    at = np.append(at[:-1], 30.0)  # as many as in the other tests, so that nothing compiles again
+    found = filter_imu(imu, at, poses, ADIS16448, POSE_NOISE)
+    assert (found.poses_used, found.poses_skipped) == (138, 61)
     assert np.isnan(found.velocity_world[:400]).all() and np.isfinite(found.velocity_world[400:]).all()
-    assert np.isfinite(found.nis).sum() == 138
+    assert np.isfinite(found.nis).sum() == 137
     np.testing.assert_array_equal(found.t, imu.t)
     np.testing.assert_allclose(found.T_world_body[800, :3, 3], lissajous_at(imu.t[800]), atol=0.01)
 
 
 def lissajous_at(t):
-    return np.asarray(lissajous(jnp.asarray(t)))[:3, 3]
+    return np.asarray(jax.jit(lissajous)(jnp.asarray(t)))[:3, 3]
 
 
 def changed(imu, row, **values):
@@ -208,9 +209,8 @@ def real(folder, every):
 
 
 @pytest.mark.data
-@pytest.mark.parametrize(
-    "name, every", [("euroc_V1_02_medium", 10), pytest.param("euroc_V1_01_easy", 1, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name, every", [("euroc_V1_02_medium", 10), ("euroc_V1_01_easy", 1)])
 def test_real_recordings(data_dir, name, every):
     """Consistent innovations over the run, and the bias of ground truth file; see the top of this file."""
     run, true = real(data_dir / name, every)
