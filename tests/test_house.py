@@ -49,10 +49,6 @@ SILENT = {f"{room}.{name}" for room, names in {
         "remove_gravity residual_sigmas retract rotate simulate simulate_from_poses transition windows"
     ),
     "jaxpose": "weighted_mean",
-    "plots": (
-        "balance cameras comparison corner_errors curves errors freedom held_out inertial preview "
-        "reconstruction renders trajectory windows"
-    ),
     "scenes": "bounding_grid grid grow image merge nerf node_positions node_shape trilinear",
     "slam": "finish load run save",
     "training": (

@@ -100,7 +100,7 @@ def test_importing_them_brings_nothing_else():
 import sys
 import jaxpose.fields, jaxpose.fields.derivatives, jaxpose.render, jaxpose.losses, jaxpose.imu
 parts = ("slam", "datasets", "experiments", "plots", "scenes", "evaluation", "training", "cli")
-others = [f"jaxpose.{part}" for part in parts] + ["matplotlib", "imageio", "PIL", "tyro", "tqdm", "evo"]
+others = [f"jaxpose.{part}" for part in parts] + ["matplotlib", "imageio", "PIL", "tyro", "evo"]
 print([name for name in others if name in sys.modules])
 """
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -7,6 +7,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from jaxpose.plots import nerf as nerf_plots
+from jaxpose.plots import style
 
 
 def read(path):
@@ -57,10 +58,8 @@ def test_cameras(tmp_path, figures, case):
     pixels = read(tmp_path / "cameras.png")
     half = pixels.shape[1] // 2
     body = slice(0, int(0.9 * len(pixels)))  # without the legend
-    assert (
-        close_to(pixels[body, :half], nerf_plots.LOST) > 100 > close_to(pixels[body, half:], nerf_plots.LOST)
-    )
-    assert close_to(pixels[body, half:], nerf_plots.ESTIMATE) > 100
+    assert close_to(pixels[body, :half], style.LOST) > 100 > close_to(pixels[body, half:], style.LOST)
+    assert close_to(pixels[body, half:], style.ESTIMATE) > 100
     (figure,) = figures
     left, right = figure.axes
     assert (len(left.lines) > 0) == (case != "jumps" and case != "two")
@@ -101,7 +100,7 @@ def test_held_out(tmp_path, figures, count):
     generator = np.random.default_rng(0)
     views = [view(generator, depth) for depth in (4.0, 0.0, np.nan, 1e8, 3.0, 5.0)]
     nerf_plots.held_out(tmp_path / "held_out.png", views[:count], "a title")
-    assert read(tmp_path / "held_out.png").shape[1] == 11 * nerf_plots.DPI
+    assert read(tmp_path / "held_out.png").shape[1] == 11 * style.DPI
     (figure,) = figures
     shown = [axes for axes in figure.axes if axes.images]
     assert len(shown) == 4 * min(count, 4)
@@ -131,7 +130,7 @@ def test_curves(tmp_path, figures, names):
     nerf_plots.curves(
         tmp_path / "curves.png", dict.fromkeys(names, run), "a title", translation_unit="% of the diameter"
     )
-    assert read(tmp_path / "curves.png").shape == (6 * nerf_plots.DPI, 11 * nerf_plots.DPI, 3)
+    assert read(tmp_path / "curves.png").shape == (6 * style.DPI, 11 * style.DPI, 3)
     (figure,) = figures
     loss, quality, rotation, translation = figure.axes
     np.testing.assert_allclose(loss.lines[0].get_ydata(), decay)

@@ -7,6 +7,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
 from jaxpose.plots import slam as slam_plots
+from jaxpose.plots import style
 
 N = 30
 
@@ -58,14 +59,14 @@ def test_trajectory(tmp_path, figures, case):
     slam_plots.trajectory(
         path, estimate, None if case == "no ground truth" else ground_truth, lost, "a title"
     )
-    assert size(path) == (round(5.2 * slam_plots.DPI), 11 * slam_plots.DPI)
+    assert size(path) == (round(5.2 * style.DPI), 11 * style.DPI)
     (figure,) = figures
     above, side = figure.axes[:2]
     assert len(figure.axes) == (2 if case == "no ground truth" else 3)  # the third is the scale of distances
     for axes, vertical in ((above, 1), (side, 2)):  # x across, y or z along
-        thick = [each for each in axes.lines if same_color(each.get_color(), slam_plots.TRUTH)]
+        thick = [each for each in axes.lines if same_color(each.get_color(), style.GROUND_TRUTH)]
         if case == "no ground truth":
-            (path_line,) = [each for each in axes.lines if same_color(each.get_color(), slam_plots.ESTIMATE)]
+            (path_line,) = [each for each in axes.lines if same_color(each.get_color(), style.ESTIMATE)]
             assert_allclose(path_line.get_xydata(), estimate[:, [0, vertical], 3])
             assert not thick and not axes.collections
         else:
@@ -83,11 +84,11 @@ def test_trajectory(tmp_path, figures, case):
 
 
 def test_trajectory_is_seen_along_the_vertical_axis_of_the_world():
-    assert slam_plots._view_axes(circle()) == (0, 1, 2, 1)
+    assert style.view_axes(circle()) == (0, 1, 2, 1)
     kinect = np.tile(np.eye(4), (N, 1, 1))  # a world in the axes of its first camera: up is -y
     kinect[:, 2, 3] = np.linspace(0, 3, N)
     kinect[:, 0, 3] = np.linspace(0, 1, N)
-    assert slam_plots._view_axes(kinect) == (2, 0, 1, -1)
+    assert style.view_axes(kinect) == (2, 0, 1, -1)
 
 
 @pytest.mark.parametrize("lost", [(), (0, 5, 29)])
@@ -98,7 +99,7 @@ def test_errors(tmp_path, figures, lost):
     slam_plots.errors(
         tmp_path / "errors.png", t, translation, 10 * translation, lost_frames(*lost), "a title"
     )
-    assert size(tmp_path / "errors.png") == (5 * slam_plots.DPI, 10 * slam_plots.DPI)
+    assert size(tmp_path / "errors.png") == (5 * style.DPI, 10 * style.DPI)
     (figure,) = figures
     for axes, values, unit in zip(
         figure.axes, (100 * translation, 10 * translation), ("cm", "deg"), strict=True
@@ -106,7 +107,7 @@ def test_errors(tmp_path, figures, lost):
         assert_allclose(axes.lines[0].get_xydata(), np.stack([t, values], -1))
         rmse = np.sqrt(np.mean(np.delete(values, 4) ** 2))
         assert_allclose(line(axes, f"RMSE {rmse:.2f} {unit}").get_ydata(), rmse)
-        stripes = [each for each in axes.lines if same_color(each.get_color(), slam_plots.LOST)]
+        stripes = [each for each in axes.lines if same_color(each.get_color(), style.LOST)]
         assert [each.get_xdata()[0] for each in stripes] == [t[k] for k in lost]
 
 
@@ -126,7 +127,7 @@ def test_renders(tmp_path, figures, count):
     views = [view, nothing, view][:count]
     slam_plots.renders(tmp_path / "renders.png", views, "a title")
     height, width = size(tmp_path / "renders.png")
-    assert width == 11 * slam_plots.DPI and height > 120 * count
+    assert width == 11 * style.DPI and height > 120 * count
     (figure,) = figures
     cells = [axes for axes in figure.axes if axes.images][: 5 * count]
     for k, each in enumerate(views):
@@ -147,7 +148,7 @@ def test_inertial(tmp_path, figures):
     t = np.linspace(0, 3, 600)
     read = np.stack([np.sin(t), np.cos(t), 0 * t], -1)
     slam_plots.inertial(tmp_path / "inertial.png", t, (read, 0.9 * read), (read, 40 * read), "a")
-    assert size(tmp_path / "inertial.png") == (6 * slam_plots.DPI, 11 * slam_plots.DPI)
+    assert size(tmp_path / "inertial.png") == (6 * style.DPI, 11 * style.DPI)
     (figure,) = figures
     for column, factor in ((0, 0.9), (1, 40)):
         for k in range(3):
@@ -163,7 +164,7 @@ def test_comparison(tmp_path, figures):
     t = np.linspace(0, 3, N)
     errors = {"none": np.exp(t), "tight": np.full(N, 0.01), "combined": np.full(N, 0.008)}
     slam_plots.comparison(tmp_path / "comparison.png", t, errors, "a title")
-    assert size(tmp_path / "comparison.png") == (round(4.2 * slam_plots.DPI), 11 * slam_plots.DPI)
+    assert size(tmp_path / "comparison.png") == (round(4.2 * style.DPI), 11 * style.DPI)
     (figure,) = figures
     curves, bars = figure.axes
     for mode, values in errors.items():
@@ -177,7 +178,7 @@ def test_comparison(tmp_path, figures):
 def test_freedom(tmp_path, figures):
     before, after = np.full(N, 5), np.repeat([1, 2, 3], N // 3)
     slam_plots.freedom(tmp_path / "freedom.png", np.linspace(0, 3, N), before, after, "a title")
-    assert size(tmp_path / "freedom.png") == (round(3.6 * slam_plots.DPI), 11 * slam_plots.DPI)
+    assert size(tmp_path / "freedom.png") == (round(3.6 * style.DPI), 11 * style.DPI)
     (figure,) = figures
     curves, bars = figure.axes
     assert [text.get_text() for text in curves.get_legend().get_texts()] == [

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from types import MappingProxyType
 from typing import NamedTuple, Protocol, runtime_checkable
 
-_SILENCE_S = 4.0  # after which the last line is said again with its time
+_SILENCE_S = 3.0  # after which the last line is said again with its time
 _REDRAW_S = 0.1
 
 

@@ -8,7 +8,13 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jaxpose.plots.slam import _AXES, _STYLE, DPI, ESTIMATE, TRUTH, _keys, _save, _shaded, _view_axes
+from jaxpose.plots.style import (
+    DPI,
+    ESTIMATE,
+    STYLE,
+    paths,
+    save,
+)
 
 
 def comparison(
@@ -22,31 +28,24 @@ def comparison(
 ) -> None:
     """Positions from above and from the side, the estimate's coloured by its error, and errors over time.
 
-    `estimate` is drawn as it comes: align it as its error was computed. The time starts at the first
-    timestamp; without `t` [s] errors are drawn over the number of the pose. Errors of less than a metre are
-    in cm.
+    Errors of less than a metre are in cm.
+
+    Args:
+        path: PNG to write.
+        t: times [s]; None: errors are drawn over the number of the pose.
+        estimate: poses, aligned as their errors were computed.
+        reference: poses they are compared with.
+        translation_m: error of each pose [m].
+        rotation_deg: error of each pose [deg].
+        title: of the figure.
     """
-    across, along, up, sign = _view_axes(reference)
     unit, factor = ("cm", 100.0) if np.nanmax(translation_m) < 1 else ("m", 1.0)
     errors, over = factor * translation_m, np.arange(float(len(estimate))) if t is None else t - t[0]
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(11, 8), dpi=DPI, layout="constrained")
         cells = figure.add_gridspec(4, 2, height_ratios=[2.6, 0.05, 1, 1])
         views = [figure.add_subplot(cells[0, k]) for k in range(2)]
-        shade = None
-        for axes, (a, b), name in zip(
-            views, ((across, along), (across, up)), ("from above", "from the side"), strict=True
-        ):
-            axes.plot(*reference[:, [a, b], 3].T, color=TRUTH, lw=3.5, alpha=0.5)
-            centres = estimate[:, [a, b], 3]
-            shade = _shaded(axes, centres, errors)
-            axes.plot(*centres[0], "o", color="black", ms=5, zorder=4)
-            axes.set(title=name, xlabel=f"{_AXES[a]} [m]", ylabel=f"{_AXES[b]} [m]")
-            axes.set_aspect("equal", adjustable="datalim")
-            axes.autoscale_view()
-        if sign < 0:
-            views[1].invert_yaxis()
-        views[0].legend(handles=_keys(ground_truth=True, lost=False), loc="best")
+        shade = paths(views, estimate, reference, errors, np.zeros(len(estimate), bool))
         assert shade is not None
         label = f"distance to the reference [{unit}]"
         figure.colorbar(shade, cax=figure.add_subplot(cells[1, :]), orientation="horizontal", label=label)
@@ -64,4 +63,4 @@ def comparison(
             axes.legend(loc="upper left")
         below[-1].set(xlabel="pose" if t is None else "time since the first [s]")
         figure.suptitle(title)
-        _save(figure, path)
+        save(figure, path)

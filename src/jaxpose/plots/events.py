@@ -10,14 +10,24 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 
 from jaxpose.events import Events
-from jaxpose.plots.slam import _STYLE, DPI, ESTIMATE, LOST, _save
+from jaxpose.plots.style import DPI, ESTIMATE, LOST, STYLE, save
 
 _WINDOWS = 4
 _MOST = 3  # events of a pixel at the end of the scale
 
 
 def balance(events: Events, height: int, width: int, span: tuple[float, float]) -> Float[np.ndarray, "h w"]:
-    """Brighter minus darker events of each pixel from `span[0]` up to `span[1]` [s]."""
+    """Brighter minus darker events of each pixel.
+
+    Args:
+        events: in the order of time.
+        height: of the sensor [px].
+        width: of the sensor [px].
+        span: first time, and the one before which events count [s].
+
+    Returns:
+        A count per pixel.
+    """
     inside = slice(*np.searchsorted(events.t, span))
     total = np.zeros((height, width))
     np.add.at(total, (events.y[inside], events.x[inside]), events.polarity[inside].astype(float))
@@ -25,12 +35,20 @@ def balance(events: Events, height: int, width: int, span: tuple[float, float]) 
 
 
 def windows(path: Path | str, events: Events, height: int, width: int, title: str) -> None:
-    """The events of four short times, evenly over the recording: brighter red, darker blue."""
+    """The events of four short times, evenly over the recording: brighter red, darker blue.
+
+    Args:
+        path: PNG to write.
+        events: in the order of time.
+        height: of the sensor [px].
+        width: of the sensor [px].
+        title: of the figure.
+    """
     first, last = float(events.t[0]), float(events.t[-1])
     # As long as it takes for one pixel in four to report something.
     length = (last - first) * min(1.0, height * width / (4 * max(len(events.t), 1)))
     starts = first + (np.arange(_WINDOWS) + 0.5) / _WINDOWS * (last - first - length)
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(11, 1.5 + 2.6 * height / width), dpi=DPI, layout="constrained")
         panels: Any = figure.subplots(1, _WINDOWS)
         for axes, start in zip(panels, starts, strict=True):
@@ -47,7 +65,7 @@ def windows(path: Path | str, events: Events, height: int, width: int, title: st
             label="events brighter (red) less darker (blue)",
         )  # fmt: skip
         figure.suptitle(title)
-        _save(figure, path)
+        save(figure, path)
 
 
 def errors(
@@ -57,8 +75,16 @@ def errors(
     end: Sequence[Float[np.ndarray, " m"]],
     title: str,
 ) -> None:
-    """Rotation [deg] and translation [scene units] errors over the motion, at the start and as found."""
-    with matplotlib.rc_context(_STYLE):
+    """Pose errors over the motion, at the start of a training and at its end.
+
+    Args:
+        path: PNG to write.
+        t: times [s].
+        start: rotation [deg] and translation [scene units] errors at the start.
+        end: the same at the end.
+        title: of the figure.
+    """
+    with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(11, 4.6), dpi=DPI, layout="constrained")
         panels: Any = figure.subplots(2, 1, sharex=True)
         labels = ("rotation error [deg]", "translation error [units]")
@@ -69,4 +95,4 @@ def errors(
         panels[-1].set(xlabel="time [s]")
         figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
         figure.suptitle(title)
-        _save(figure, path)
+        save(figure, path)

@@ -14,7 +14,18 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
 from jaxpose.evaluation.image_quality import psnr
-from jaxpose.plots.slam import _AXES, _STYLE, DPI, ESTIMATE, LOST, SENSOR, TRUTH, _gapped, _save, _view_axes
+from jaxpose.plots.style import (
+    AXES,
+    DPI,
+    ESTIMATE,
+    GROUND_TRUTH,
+    LOST,
+    SENSOR,
+    STYLE,
+    gapped,
+    save,
+    view_axes,
+)
 
 _TICK = 0.13  # length of a drawn frustum, in extents of the true cameras
 _MOST_FRUSTA = 30
@@ -49,15 +60,19 @@ def cameras(
     estimate: Float[np.ndarray, "n 4 4"],
     title: str,
 ) -> None:
-    """Camera-to-world poses in 3D: start and ground truth on the left.
+    """Cameras in 3D: start and ground truth on the left, estimate and ground truth on the right.
 
-    Estimate and ground truth on the right.
+    A line joins each camera with its true place; of many cameras only some are drawn as frusta. Upright is
+    the world axis nearest to the cameras' mean up.
 
-    A line joins each camera with its true place; of many cameras only some are drawn as frusta. All are
-    drawn as they come: align them as their errors were computed. Upright is the world axis nearest to the
-    cameras' mean up; scene units.
+    Args:
+        path: PNG to write.
+        ground_truth: camera-to-world poses [scene units].
+        start: poses before a training, aligned as their errors were computed.
+        estimate: poses after it, aligned in the same way.
+        title: of the figure.
     """
-    across, along, up, sign = _view_axes(ground_truth)
+    across, along, up, sign = view_axes(ground_truth)
     order = [across, along, up]
     if np.linalg.det(np.eye(3)[order]) * sign < 0:
         order[:2] = along, across  # or the picture would be a mirror image
@@ -66,7 +81,7 @@ def cameras(
     length = _TICK * extent
     is_path = np.median(np.linalg.norm(np.diff(centres, axis=0), axis=1)) < _PATH_STEP * extent
     shown = slice(None, None, -(-len(ground_truth) // _MOST_FRUSTA))
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(11, 5.4), dpi=DPI, layout="constrained")
         panels: list[Any] = list(figure.subplots(1, 2, subplot_kw={"projection": "3d"}))
         for axes, poses, color, name in zip(
@@ -75,7 +90,7 @@ def cameras(
             joints = np.stack([poses[:, order, 3], ground_truth[:, order, 3]], axis=1)
             joints = joints if is_path else joints[shown]
             axes.add_collection3d(Line3DCollection(list(joints), colors=color, lw=0.8, alpha=0.35))
-            for T, shade, width in ((ground_truth, TRUTH, 1.7), (poses, color, 0.9)):
+            for T, shade, width in ((ground_truth, GROUND_TRUTH, 1.7), (poses, color, 0.9)):
                 if is_path:
                     axes.plot(*T[:, order, 3].T, color=shade, lw=width)
                 edges = _frusta(T[shown], length)[..., order]
@@ -83,28 +98,35 @@ def cameras(
             axes.set(title=f"{name} and ground truth")
         _equal_axes(panels, np.concatenate([ground_truth, start, estimate])[:, order, 3], length, sign < 0)
         for axes in panels:
-            axes.set(xlabel=_AXES[order[0]], ylabel=_AXES[order[1]], zlabel=_AXES[order[2]])
+            axes.set(xlabel=AXES[order[0]], ylabel=AXES[order[1]], zlabel=AXES[order[2]])
             axes.view_init(elev=28, azim=-58)
             axes.tick_params(labelsize=7)
             axes.locator_params(nbins=5)
-        colors = {"ground_truth": TRUTH, "start": LOST, "estimate": ESTIMATE}
+        colors = {"ground truth": GROUND_TRUTH, "start": LOST, "estimate": ESTIMATE}
         keys = [Line2D([], [], color=color, lw=1.6, label=name) for name, color in colors.items()]
         figure.legend(handles=keys, loc="outside lower center", ncols=3)
         figure.suptitle(title)
-        _save(figure, path)
+        save(figure, path)
 
 
 def held_out(
     path: Path | str, views: Sequence[HeldOut], title: str, *, photograph: str = "held-out photograph"
 ) -> None:
-    """Photograph, render, depth and colour difference side by side, one row a view, at most four."""
+    """Photograph, render, depth and colour difference side by side, one row a view.
+
+    Args:
+        path: PNG to write.
+        views: of which the first four are drawn.
+        title: of the figure.
+        photograph: title of the first column.
+    """
     views = views[:4]
     depths = np.concatenate([view.rendered_depth.ravel() for view in views])
     depths = depths[(depths > 0) & np.isfinite(depths)]
     # Few rays see very far: they would take the colours from all others.
     near, far = np.percentile(depths, (2, 95)) if len(depths) else (0.0, 1.0)
     height, width = views[0].rendered_depth.shape
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(STYLE):
         figure = Figure(
             figsize=(11, 1.1 + len(views) * (10.6 / 4 * height / width + 0.06)), dpi=DPI, layout="constrained"
         )
@@ -123,7 +145,7 @@ def held_out(
             row[0].imshow(view.rgb)
             row[1].imshow(rendered)
             shades = [
-                row[2].imshow(depth, cmap=_gapped("viridis"), vmin=near, vmax=far),
+                row[2].imshow(depth, cmap=gapped("viridis"), vmin=near, vmax=far),
                 row[3].imshow(difference, cmap="magma", vmin=0, vmax=_WORST),
             ]
             row[0].set_ylabel(view.label)
@@ -134,14 +156,21 @@ def held_out(
             bar = figure.add_subplot(cells[-1, column])
             figure.colorbar(shade, cax=bar, orientation="horizontal", label=label)
         figure.suptitle(title)
-        _save(figure, path)
+        save(figure, path)
 
 
 def curves(
     path: Path | str, runs: Mapping[str, History], title: str, *, translation_unit: str = "scene units"
 ) -> None:
-    """Loss, PSNR and pose errors over the steps, one line a run; errors and loss on logarithmic scales."""
-    with matplotlib.rc_context(_STYLE):
+    """Loss, PSNR and pose errors over the steps; errors and loss on logarithmic scales.
+
+    Args:
+        path: PNG to write.
+        runs: one line each, by label.
+        title: of the figure.
+        translation_unit: of the translation errors.
+    """
+    with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(11, 6), dpi=DPI, layout="constrained")
         panels: list[Axes] = list(np.asarray(figure.subplots(2, 2, sharex=True)).ravel())
         labels = ("loss", "PSNR [dB]", "rotation error [deg]", f"translation error [{translation_unit}]")
@@ -166,7 +195,7 @@ def curves(
             handles = panels[0].get_legend_handles_labels()
             figure.legend(*handles, loc="outside lower center", ncols=min(len(runs), 4))
         figure.suptitle(title)
-        _save(figure, path)
+        save(figure, path)
 
 
 def _equal_axes(

@@ -11,10 +11,9 @@ from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from jaxpose.files.atomic import atomic
-from jaxpose.plots.slam import _STYLE, DPI, ESTIMATE, LOST
+from jaxpose.plots.style import DPI, ESTIMATE, LOST, STYLE, save
 
-_TRUTH, _START, _ESTIMATE = "#ffffff", "#f5c518", "#35c8f5"  # over a photograph, not over paper
+_GROUND_TRUTH, _START, _ESTIMATE = "#ffffff", "#f5c518", "#35c8f5"  # over a photograph, not over paper
 _FIELDS = {"posenet": ESTIMATE, "per_frame": "#e0902f", "spline_reset": "#b5322d", "bspline": "#5a9e5a"}
 _FLOOR = 1e-3  # [px] of a logarithmic axis
 
@@ -29,14 +28,19 @@ def reconstruction(
 ) -> None:
     """A photograph with the outlines of its patches beside the neural image that was made from them.
 
-    Images are in [0, 1]; `outlines` are corners [px] under the names ground truth, start and estimate. What
-    no patch has `covered` is faded in both: nothing is known there.
+    Args:
+        path: PNG to write.
+        photograph: colours in [0, 1].
+        neural: colours in [0, 1].
+        covered: pixels that a patch covers; the others, of which nothing is known, are faded in both.
+        outlines: corners [px] of the patches, under the names ground_truth, start and estimate.
+        title: of the figure.
     """
     fade = np.where(covered, 1.0, 0.3)[..., None]
     height, width = photograph.shape[:2]
-    colours = {"ground_truth": _TRUTH, "start": _START, "estimate": _ESTIMATE}
+    colours = {"ground_truth": _GROUND_TRUTH, "start": _START, "estimate": _ESTIMATE}
     styles = {"ground_truth": (3.4, "solid"), "start": (2.2, "dashed"), "estimate": (1.3, "solid")}
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(12, 12 * 0.5 * height / width + 0.9), dpi=DPI, layout="constrained")
         left, right = figure.subplots(1, 2)
         for axes, picture, drawn, name in (
@@ -53,14 +57,16 @@ def reconstruction(
                 )
             axes.set(title=name, xticks=[], yticks=[], xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
             axes.grid(False)
-        keys = [Line2D([], [], color=colours[k], lw=styles[k][0], ls=styles[k][1], label=k) for k in outlines]
+        keys = [
+            Line2D([], [], color=colours[k], lw=styles[k][0], ls=styles[k][1], label=k.replace("_", " "))
+            for k in outlines
+        ]
         legend = figure.legend(handles=keys, loc="outside lower center", ncols=len(keys), frameon=True)
         legend.get_frame().set(facecolor="#6b6b6b", edgecolor="none")
         for text in legend.get_texts():
             text.set_color("white")
         figure.suptitle(title)
-        with atomic(path) as temporary:
-            figure.savefig(temporary)
+        save(figure, path)
 
 
 def corner_errors(
@@ -70,8 +76,16 @@ def corner_errors(
     success_px: float,
     title: str,
 ) -> None:
-    """Corner error [px] over steps: a thin line per motion, the median bold, a panel per pose field."""
-    with matplotlib.rc_context(_STYLE):
+    """Corner errors over steps: a thin line per motion, the median bold, a panel per pose field.
+
+    Args:
+        path: PNG to write.
+        steps: at which errors are known.
+        curves: errors [px] of each motion, by pose field.
+        success_px: error below which a motion is found.
+        title: of the figure.
+    """
+    with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(max(6.0, 3.6 * len(curves)), 4.2), dpi=DPI, layout="constrained")
         panels: list[Axes] = list(figure.subplots(1, len(curves), sharey=True, squeeze=False)[0])
         for axes, (name, errors) in zip(panels, curves.items(), strict=True):
@@ -86,5 +100,4 @@ def corner_errors(
         panels[0].set_ylabel("corner error [px]")
         panels[0].legend(loc="lower left")
         figure.suptitle(title)
-        with atomic(path) as temporary:
-            figure.savefig(temporary)
+        save(figure, path)

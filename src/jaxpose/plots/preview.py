@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from matplotlib.figure import Figure
 
-from jaxpose.files.atomic import atomic
-from jaxpose.plots.slam import ESTIMATE, LOST, View
+from jaxpose.plots.slam import View
+from jaxpose.plots.style import ESTIMATE, LOST, save
 
 
 def preview(
@@ -17,6 +17,12 @@ def preview(
     """The cameras so far from above, and the last frame beside the map as seen from its estimated pose.
 
     From above is along the world axis nearest to the cameras' mean up.
+
+    Args:
+        path: PNG to write.
+        T_world_cam: poses of the frames so far.
+        lost: frames that tracking lost.
+        view: the last frame, and the map from its pose.
     """
     up = int(np.abs(T_world_cam[:, :3, 1].mean(axis=0)).argmax())
     a, b = sorted({0, 1, 2} - {up})
@@ -36,5 +42,4 @@ def preview(
         axes.imshow(image, vmin=0, vmax=deepest, cmap=matplotlib.colormaps["viridis"])
         axes.set_title(name, fontsize=8)
         axes.set_axis_off()
-    with atomic(path) as temporary:
-        figure.savefig(temporary)
+    save(figure, path)

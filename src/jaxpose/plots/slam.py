@@ -2,35 +2,29 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import matplotlib
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
-from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.ticker import NullFormatter
 from scipy.ndimage import uniform_filter1d
 
-from jaxpose.files.atomic import atomic
+from jaxpose.plots.style import (
+    AXES,
+    DPI,
+    ESTIMATE,
+    GROUND_TRUTH,
+    LOST,
+    SENSOR,
+    STYLE,
+    gapped,
+    paths,
+    save,
+)
 
-DPI = 120
-TRUTH, ESTIMATE, LOST, SENSOR = "#8a8a8a", "#1f5fa8", "#d1342f", "#f0a860"
-_STYLE: Any = {
-    "font.size": 9,
-    "axes.titlesize": 10,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "grid.color": "#e6e6e6",
-    "grid.linewidth": 0.6,
-    "axes.axisbelow": True,
-    "legend.frameon": False,
-}
-_AXES = "xyz"
 _VIEW_TITLES = ("input colour", "rendered colour", "input depth", "rendered depth", "rendered - input depth")
 _MODES = {
     "none": "#8a8a8a",
@@ -60,38 +54,24 @@ def trajectory(
 ) -> None:
     """Camera centres from above and from the side, coloured by their distance to the reference, if any.
 
-    `estimate` is drawn as it comes: align it as its error was computed. The view from above is along the
-    world axis nearest to the cameras' mean up.
+    The view from above is along the world axis nearest to the cameras' mean up.
+
+    Args:
+        path: PNG to write.
+        estimate: poses, aligned as their errors were computed.
+        reference: ground truth; None: there is none.
+        lost: frames that tracking lost.
+        title: of the figure.
     """
-    ground_truth = estimate if reference is None else reference
-    usable = np.isfinite(ground_truth).all(axis=(1, 2))
-    across, along, up, sign = _view_axes(ground_truth[usable])
-    with matplotlib.rc_context(_STYLE):
+    off = None if reference is None else 100 * _distances(estimate, reference)
+    with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(11, 5.2), dpi=DPI, layout="constrained")
         views: list[Axes] = list(figure.subplots(1, 2))
-        shade = None
-        for axes, (a, b), name in zip(
-            views, ((across, along), (across, up)), ("from above", "from the side"), strict=True
-        ):
-            if reference is not None:
-                axes.plot(*ground_truth[usable][:, [a, b], 3].T, color=TRUTH, lw=3.5, alpha=0.5)
-            centres = estimate[:, [a, b], 3]
-            if reference is None:
-                axes.plot(*centres.T, color=ESTIMATE, lw=1.4)
-            else:
-                shade = _shaded(axes, centres, 100 * _distances(estimate, reference))
-            axes.plot(*centres[0], "o", color="black", ms=5, zorder=4)
-            axes.plot(*centres[lost].T, "x", color=LOST, ms=6, mew=1.6, zorder=5)
-            axes.set(title=name, xlabel=f"{_AXES[a]} [m]", ylabel=f"{_AXES[b]} [m]")
-            axes.set_aspect("equal", adjustable="datalim")
-            axes.autoscale_view()
-        if sign < 0:
-            views[1].invert_yaxis()
+        shade = paths(views, estimate, reference, off, lost)
         if shade is not None:
             figure.colorbar(shade, ax=views, label="distance to the ground truth [cm]", shrink=0.9, pad=0.015)
-        views[0].legend(handles=_keys(reference is not None, bool(lost.any())), loc="best")
         figure.suptitle(title)
-        _save(figure, path)
+        save(figure, path)
 
 
 def errors(
@@ -102,8 +82,17 @@ def errors(
     lost: Bool[np.ndarray, " n"],
     title: str,
 ) -> None:
-    """Errors of every frame over time, their root mean square, and the frames that tracking lost."""
-    with matplotlib.rc_context(_STYLE):
+    """Errors of every frame over time, their root mean square, and the frames that tracking lost.
+
+    Args:
+        path: PNG to write.
+        t: times of the frames [s].
+        translation_m: errors [m], NaN where there is no ground truth.
+        rotation_deg: errors [deg], NaN where there is no ground truth.
+        lost: frames that tracking lost.
+        title: of the figure.
+    """
+    with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(10, 5), dpi=DPI, layout="constrained")
         rows: list[Axes] = list(figure.subplots(2, 1, sharex=True))
         for axes, values, unit, name in zip(
@@ -118,16 +107,22 @@ def errors(
             axes.legend(loc="upper left", ncols=2)
         rows[-1].set(xlabel="time [s]", xlim=(t[0], t[-1]))
         figure.suptitle(title)
-        _save(figure, path)
+        save(figure, path)
 
 
 def renders(path: Path | str, views: Sequence[View], title: str) -> None:
-    """Input and rendered colour and depth side by side, one row a frame, and where the depths differ."""
+    """Input and rendered colour and depth side by side, one row a frame, and where the depths differ.
+
+    Args:
+        path: PNG to write.
+        views: one a row.
+        title: of the figure.
+    """
     worst = 10.0  # [cm], the end of the error's scale
     deepest = float(np.percentile(np.concatenate([v.depth[v.depth > 0] for v in views] + [np.ones(1)]), 99))
     height, width = views[0].depth.shape
     row_height = 10.6 / 5 * height / width + 0.06
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(11, 1.1 + len(views) * row_height), dpi=DPI, layout="constrained")
         figure.get_layout_engine().set(w_pad=0.02, h_pad=0.045)  # type: ignore[union-attr]
         cells = figure.add_gridspec(len(views) + 1, 5, height_ratios=[1] * len(views) + [0.05])
@@ -143,8 +138,8 @@ def renders(path: Path | str, views: Sequence[View], title: str) -> None:
             row[0].imshow(view.rgb)
             row[1].imshow(np.clip(view.rendered_rgb, 0, 1))
             for axes, depth in ((row[2], view.depth), (row[3], view.rendered_depth)):
-                depth_shade = axes.imshow(_known(depth), cmap=_gapped("viridis"), vmin=0, vmax=deepest)
-            error_shade = row[4].imshow(error, cmap=_gapped("RdBu_r"), vmin=-worst, vmax=worst)
+                depth_shade = axes.imshow(_known(depth), cmap=gapped("viridis"), vmin=0, vmax=deepest)
+            error_shade = row[4].imshow(error, cmap=gapped("RdBu_r"), vmin=-worst, vmax=worst)
             row[0].set_ylabel(view.label)
             median = f"{np.nanmedian(np.abs(error)):.1f} cm" if both.any() else "unknown"
             row[4].text(
@@ -161,7 +156,7 @@ def renders(path: Path | str, views: Sequence[View], title: str) -> None:
             assert shade is not None
             figure.colorbar(shade, cax=figure.add_subplot(where), orientation="horizontal", label=label)
         figure.suptitle(title)
-        _save(figure, path)
+        save(figure, path)
 
 
 def inertial(
@@ -171,11 +166,16 @@ def inertial(
     accelerometer: tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]],
     title: str,
 ) -> None:
-    """What the sensor read and what the field's derivatives are, in body axes: (read, field) of each.
+    """Readings of an IMU and derivatives of a field, in body axes.
 
-    Rates in rad/s; accelerations without gravity in m/s^2.
+    Args:
+        path: PNG to write.
+        t: times [s].
+        gyro: body rates [rad/s], read and of the field.
+        accelerometer: accelerations without gravity [m/s^2], read and of the field.
+        title: of the figure.
     """
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(11, 6), dpi=DPI, layout="constrained")
         grid = np.asarray(figure.subplots(3, 2, sharex=True, sharey="col"))
         for column, (read, field), unit, name in zip(
@@ -189,7 +189,7 @@ def inertial(
             for k, axes in enumerate(column):
                 axes.plot(t, read[:, k], color=SENSOR, lw=1.3, label="IMU", zorder=3)
                 axes.plot(t, field[:, k], color=ESTIMATE, lw=1.1, label="derivative of the field")
-                axes.set(ylabel=f"{_AXES[k]} [{unit}]")
+                axes.set(ylabel=f"{AXES[k]} [{unit}]")
             span = float(np.percentile(np.abs(read), 99.8))
             column[0].set_ylim(
                 -1.4 * span, 1.4 * span
@@ -198,7 +198,7 @@ def inertial(
             column[-1].set(xlabel="time [s]", xlim=(t[0], t[-1]))
         figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
         figure.suptitle(title)
-        _save(figure, path)
+        save(figure, path)
 
 
 def comparison(
@@ -207,8 +207,15 @@ def comparison(
     errors_m: Mapping[str, Float[np.ndarray, " n"]],
     title: str,
 ) -> None:
-    """Translation error over time and its root mean square, one curve and one bar per IMU mode."""
-    with matplotlib.rc_context(_STYLE):
+    """Translation error over time and its root mean square, one curve and one bar per IMU mode.
+
+    Args:
+        path: PNG to write.
+        t: times of the frames [s].
+        errors_m: error of each frame [m], by IMU mode.
+        title: of the figure.
+    """
+    with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(11, 4.2), dpi=DPI, layout="constrained")
         curves, bars = figure.subplots(1, 2, width_ratios=(2.4, 1))
         rmse = {name: 100 * float(np.sqrt(np.nanmean(values**2))) for name, values in errors_m.items()}
@@ -229,7 +236,7 @@ def comparison(
         bars.set(xlabel="ATE-RMSE [cm]")
         bars.grid(False)
         figure.suptitle(title)
-        _save(figure, path)
+        save(figure, path)
 
 
 def freedom(
@@ -239,12 +246,20 @@ def freedom(
     after: Int[np.ndarray, " n"],
     title: str,
 ) -> None:
-    """Degrees of freedom over time, before and after, as means of ten motions, and how often each occurs."""
-    with matplotlib.rc_context(_STYLE):
+    """Degrees of freedom over time, as means of ten motions, and how often each occurs.
+
+    Args:
+        path: PNG to write.
+        t: times of the frames [s].
+        before: of the motion from frame to frame.
+        after: of the same motion in the intrinsic frame.
+        title: of the figure.
+    """
+    with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(11, 3.6), dpi=DPI, layout="constrained")
         curves, bars = figure.subplots(1, 2, width_ratios=(2.4, 1))
         for k, (name, dof, colour) in enumerate((
-            ("frame to frame", before, TRUTH),
+            ("frame to frame", before, GROUND_TRUTH),
             ("intrinsic frame", after, ESTIMATE),
         )):  # fmt: skip
             label = f"{name}, mean {dof.mean():.2f}"
@@ -256,48 +271,11 @@ def freedom(
         curves.legend(loc="best", ncols=2)
         bars.set(xlabel="degrees of freedom", ylabel="share of motions")
         figure.suptitle(title)
-        _save(figure, path)
-
-
-def _save(figure: Figure, path: Path | str) -> None:
-    with atomic(path) as temporary:
-        figure.savefig(temporary)
+        save(figure, path)
 
 
 def _distances(estimate: Float[np.ndarray, "n 4 4"], reference: Float[np.ndarray, "n 4 4"]) -> np.ndarray:
     return np.linalg.norm(estimate[:, :3, 3] - reference[:, :3, 3], axis=1)
-
-
-def _view_axes(poses: Float[np.ndarray, "n 4 4"]) -> tuple[int, int, int, int]:
-    """The wider and the narrower horizontal world axis, the vertical one, and the sign of up along it."""
-    mean_up = -poses[:, :3, 1].mean(axis=0)  # y of a camera is down
-    up = int(np.abs(mean_up).argmax())
-    extent = np.ptp(poses[:, :3, 3], axis=0)
-    across, along = sorted({0, 1, 2} - {up}, key=lambda k: -extent[k])
-    return across, along, up, 1 if mean_up[up] >= 0 else -1
-
-
-def _shaded(axes: Axes, centres: Float[np.ndarray, "n 2"], values: Float[np.ndarray, " n"]) -> LineCollection:
-    """A path coloured by a value at each of its points (their mean along each segment)."""
-    segments = np.stack([centres[:-1], centres[1:]], axis=1)
-    means = (values[:-1] + values[1:]) / 2
-    shades = ListedColormap(matplotlib.colormaps["plasma_r"](np.linspace(0.15, 1, 256)))  # not the palest
-    line = LineCollection(list(segments), cmap=shades, lw=2, zorder=3)
-    line.set_array(means)
-    finite = values[np.isfinite(values)]
-    line.set_clim(0, float(finite.max()) if len(finite) else 1.0)
-    axes.add_collection(line)
-    return line
-
-
-def _keys(ground_truth: bool, lost: bool) -> list[Line2D]:
-    """Legend of a trajectory."""
-    keys = [Line2D([], [], color=TRUTH, lw=3.5, alpha=0.5, label="ground_truth")] if ground_truth else []
-    keys.append(Line2D([], [], color="#9c2c8c" if ground_truth else ESTIMATE, lw=2, label="estimate"))
-    keys.append(Line2D([], [], color="black", marker="o", ls="", ms=5, label="start"))
-    if lost:
-        keys.append(Line2D([], [], color=LOST, marker="x", ls="", mew=1.6, label="lost"))
-    return keys
 
 
 def _mark(axes: Axes, t: Float[np.ndarray, " n"], lost: Bool[np.ndarray, " n"]) -> None:
@@ -309,8 +287,3 @@ def _mark(axes: Axes, t: Float[np.ndarray, " n"], lost: Bool[np.ndarray, " n"]) 
 
 def _known(depth: Float[np.ndarray, "k l"]) -> Float[np.ndarray, "k l"]:
     return np.where(depth > 0, depth, np.nan)
-
-
-def _gapped(name: str):
-    """A colour map that shows what is not known in light grey."""
-    return matplotlib.colormaps[name].with_extremes(bad="#dcdcdc")
