@@ -39,9 +39,8 @@ SILENT = {f"{room}.{name}" for room, names in {
         "project_onto_poses refine set_progress stop_rotation table velocity write_field"
     ),
     "files": (
-        "associate load nearest orthonormal peak_rss_bytes read_camera read_euroc read_kitti read_points "
-        "read_stamps read_trajectory read_tum save versions write_camera write_colmap write_euroc "
-        "write_kitti write_ply write_tum"
+        "load peak_rss_bytes read_camera read_points save versions write_camera "
+        "write_colmap write_ply"
     ),
     "imu": (
         "accelerometer_residual add_noise backward covers difference filter_imu forward gravity_note "

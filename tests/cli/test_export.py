@@ -15,7 +15,7 @@ from jaxpose.cli.export import Config
 from jaxpose.datasets.photos import blender
 from jaxpose.errors import DataError
 from jaxpose.fields import numpy_evaluator, serialization
-from jaxpose.files import atomic, trajectories, trajectory_reader
+from jaxpose.files import atomic, trajectories
 from jaxpose.files.camera_json import read_camera, write_camera
 from jaxpose.geometry.camera import Camera
 
@@ -66,9 +66,9 @@ def exported(run, format, out, **options):
 @pytest.mark.parametrize("format, stamped", [("tum", True), ("euroc", True), ("kitti", False)])
 def test_poses_come_back_from_trajectory_files(run, tmp_path, format, stamped):
     result = exported(run, format, tmp_path / "new" / "out")
-    read = trajectory_reader.read_trajectory(tmp_path / "new" / "out")
+    read = trajectories.read_trajectory(tmp_path / "new" / "out")
     written = poses_of(run)
-    assert read.stamped == stamped and result.poses == COUNT
+    assert read.has_timestamps == stamped and result.poses == COUNT
     np.testing.assert_allclose(read.trajectory.T, written.T, atol=1e-12)
     if stamped:
         np.testing.assert_allclose(read.trajectory.t, written.t, rtol=0, atol=1e-9)

@@ -1,9 +1,9 @@
-"""Photographs in part."""
+"""Photographs in part, frames as the library takes them, and what recordings share."""
 
 import numpy as np
 import pytest
 
-from jaxpose.datasets.types import Photographs, every, take
+from jaxpose.datasets.types import Frame, Photographs, Recording, check_frame, every, take
 from jaxpose.errors import DataError
 from jaxpose.geometry.camera import Camera
 
@@ -34,3 +34,50 @@ def test_every_nth_photograph():
         every(whole, 5)
     with pytest.raises(ValueError, match="at least 1, got 0"):
         every(whole, 0)
+
+
+CAMERA = Camera(4.0, 4.0, 1.5, 1.0, 4, 3)
+RGB, DEPTH = np.zeros((3, 4, 3), np.uint8), np.full((3, 4), 2.5, np.float32)
+
+
+def test_one_recording_cannot_change_another():
+    one, other = (Recording(name, CAMERA, np.arange(2.0), lambda i: Frame(RGB, DEPTH)) for name in "ab")
+    for array in (one.T_body_cam, one.gravity_world):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 7
+    np.testing.assert_array_equal(other.T_body_cam, np.eye(4))
+    np.testing.assert_array_equal(other.gravity_world, [0, 0, -9.80665])
+
+
+def test_a_frame_in_metres_is_taken_whatever_its_type():
+    depth = DEPTH.astype(np.float64)
+    depth[0, :3] = np.nan, np.inf, 0
+    frame = check_frame(Frame(RGB, depth), CAMERA)
+    assert frame.depth.dtype == np.float32
+    np.testing.assert_array_equal(frame.depth[0], [0, 0, 0, 2.5])
+    np.testing.assert_array_equal(frame.depth[1:], 2.5)
+
+
+@pytest.mark.parametrize(
+    ("rgb", "depth", "message"),
+    [
+        (
+            RGB,
+            (1000 * DEPTH).astype(np.uint16),
+            "depth: expected metres, float.*, got uint16 up to 2500",
+        ),
+        (
+            RGB,
+            1000 * DEPTH,
+            "depth: expected metres, float.*, got float32 up to 2500: divide mill",
+        ),
+        (RGB, DEPTH > 0, "depth: expected metres, floating point, got bool"),
+        (RGB, -DEPTH, "depth: expected 0 or more, got -2.5"),
+        (RGB, DEPTH.T, r"depth: expected shape \(3, 4\), got \(4, 3\)"),
+        (RGB / 255, DEPTH, r"rgb: expected shape \(3, 4, 3\) of uint8, got \(3, 4, 3\) of float64"),
+        (RGB[..., 0], DEPTH, r"rgb: expected shape \(3, 4, 3\) of uint8, got \(3, 4\) of uint8"),
+    ],
+)
+def test_a_frame_that_is_none_is_named(rgb, depth, message):
+    with pytest.raises(ValueError, match=message):
+        check_frame(Frame(rgb, depth), CAMERA)

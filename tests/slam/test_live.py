@@ -61,9 +61,9 @@ def test_the_world_is_upright_by_the_first_readings(walk):
 def test_bad_frames_are_refused_by_the_argument(walk):
     state, (rgb, depth) = slam.init(walk.camera), walk.read(0)
     for args, message in (
-        ((rgb[:-1], depth, 0.0), r"expected rgb \(60, 80, 3\) uint8, got \(59, 80, 3\) uint8"),
+        ((rgb[:-1], depth, 0.0), r"rgb: expected shape \(60, 80, 3\) of uint8, got \(59, 80, 3\)"),
         ((rgb / 255, depth, 0.0), "uint8, got .* float64"),
-        ((rgb, (1000 * depth).astype(np.uint16), 0.0), "depth .* in metres, floating point, got .* uint16"),
+        ((rgb, (1000 * depth).astype(np.uint16), 0.0), "depth: expected metres, floating point, got uint16"),
         ((rgb, depth[None], 0.0), r"got \(1, 60, 80\)"),
         ((rgb, depth, np.nan), r"expected a time \[s\], got nan"),
     ):

@@ -235,6 +235,9 @@ def test_a_recording_that_cannot_be_tracked_is_refused_in_one_line():
     recording = Recording("made", camera, np.array([0.0, 0.2]), lambda i: empty)
     with pytest.raises(DataError, match="made: expected depth in the first frame"):
         run(recording)
+    millimetres = empty._replace(depth=np.full((30, 40), 2350, np.uint16))
+    with pytest.raises(DataError, match="made: frame 0: depth: expected metres, .*, got uint16 up to 2350"):
+        run(recording._replace(read=lambda i: millimetres))
     with pytest.raises(DataError, match="needs inertial readings"):
         run(recording, SlamConfig(imu="tight"))
     with pytest.raises(DataError, match="at least 2 frames"):

@@ -20,7 +20,7 @@ from jaxpose.errors import DataError
 from jaxpose.experiments.checks import check_apart, check_positive
 from jaxpose.experiments.command import Command, execute
 from jaxpose.experiments.progress import OnUpdate, Update, silent
-from jaxpose.files import atomic, trajectories, trajectory_reader
+from jaxpose.files import atomic, trajectories
 
 if TYPE_CHECKING:
     from jaxpose.geometry.camera import Camera
@@ -129,7 +129,7 @@ def _chosen(config: Config, source: Source) -> tuple[trajectories.Trajectory, st
         return trajectories.Trajectory(asked, pose(asked)), times, ()
     if config.at is None:
         return source.trajectory, "those of the frames" if source.is_run else "those of the file", ()
-    asked = trajectory_reader.read_stamps(config.at)
+    asked = trajectories.read_timestamps(config.at)
     if not source.is_run:
         rows = trajectories.nearest(asked, t)
         strange = np.flatnonzero(~(np.abs(t[rows] - asked) < _OWN)) if source.stamped else np.arange(1)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxpose.errors import DataError
-from jaxpose.files import trajectories, trajectory_reader
+from jaxpose.files import trajectories
 
 FIELD = "field.npz"
 
@@ -35,7 +35,7 @@ def read_source(path: Path) -> Source:
     if not path.is_dir():
         if not path.exists():
             raise DataError(f"{path}: expected a trajectory file or a run folder, got nothing")
-        trajectory, name, stamped, repeated = trajectory_reader.read_trajectory(path)
+        trajectory, name, stamped, repeated = trajectories.read_trajectory(path)
         what = f"{name} file" + (f" ({repeated} left out: same timestamp as before)" if repeated else "")
         return Source(path, what, trajectory, stamped, False)
     file = path / "trajectory.txt"

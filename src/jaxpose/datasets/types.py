@@ -12,6 +12,14 @@ from jaxpose.events import Events, Mosaic
 from jaxpose.geometry.camera import Camera
 from jaxpose.imu import GRAVITY_WORLD, Imu
 
+_FARTHEST_M = 1000.0  # no sensor's depth; the least of millimetres that is taken for metres
+
+
+def _read_only(array: np.ndarray) -> np.ndarray:
+    """A default that all share: none can change it for the others."""
+    array.flags.writeable = False
+    return array
+
 
 class Frame(NamedTuple):
     """One image pair; depth is along the optical axis [m], 0 where there is none."""
@@ -28,19 +36,23 @@ class Accelerometer(NamedTuple):
 
 
 class Recording(NamedTuple):
-    """A sequence of RGB-D frames with what is known beside them; all poses float64, camera axes OpenCV."""
+    """A sequence of RGB-D frames with what is known beside them; all poses float64, camera axes OpenCV.
+
+    There is one clock: `t`, the IMU and the accelerometer are float64 seconds since `t0_ns`, which the loader
+    takes off timestamps once, as whole nanoseconds.
+    """
 
     name: str
     camera: Camera
-    t: np.ndarray  # (n,) seconds since the first frame
+    t: np.ndarray  # (n,) [s] of the frames, increasing
     read: Callable[[int], Frame]
     T_world_cam: np.ndarray | None = None  # (n, 4, 4) ground truth, rows of NaN where it is missing
     imu: Imu | None = None  # on the clock of `t`
-    T_body_cam: np.ndarray = np.eye(4)  # body = IMU
-    gravity_world: np.ndarray = np.array(GRAVITY_WORLD)  # in the frame of `T_world_cam`
+    T_body_cam: np.ndarray = _read_only(np.eye(4))  # body = IMU
+    gravity_world: np.ndarray = _read_only(np.array(GRAVITY_WORLD))  # in the frame of `T_world_cam`
     notes: tuple[str, ...] = ()  # what the loader has to tell the user
     files: tuple[str, ...] = ()  # each colour image, relative to the recording's folder; empty: on no disk
-    t0: float = 0.0  # where `t` is 0 on the clock of the recording's files [s]
+    t0_ns: int = 0  # where `t` is 0 on the clock of the recording's files [ns]
     accelerometer: Accelerometer | None = None  # on the clock of `t`, of a recording without IMU
 
 
@@ -110,10 +122,7 @@ def from_arrays(
     check_increasing(t=t)
     if len(t) == 0:
         raise ValueError("t: expected at least 1 frame, got none")
-    if rgb.dtype != np.uint8:
-        raise ValueError(f"rgb: expected uint8, got {rgb.dtype}")
-    if not np.issubdtype(depth.dtype, np.floating):
-        raise ValueError(f"depth: expected metres, floating point, got {depth.dtype}")
+    check_frame(Frame(rgb[0], depth[0]), camera)
     if T_world_cam is not None:
         check_shapes(t=(t, "n"), T_world_cam=(T_world_cam, "n 4 4"))
     if T_body_cam is not None:
@@ -122,12 +131,45 @@ def from_arrays(
         name,
         camera,
         t - t[0],
-        lambda i: Frame(rgb[i], np.where(np.isfinite(depth[i]), depth[i], 0).astype(np.float32)),
+        lambda i: Frame(rgb[i], depth[i]),
         T_world_cam=T_world_cam,
         imu=None if imu is None else imu._replace(t=np.asarray(imu.t, np.float64) - t[0]),
         T_body_cam=np.eye(4) if T_body_cam is None else T_body_cam,
-        t0=float(t[0]),
+        t0_ns=round(float(t[0]) * 1e9),
     )
+
+
+def check_frame(frame: Frame, camera: Camera) -> Frame:
+    """A frame as the library works with it, whoever made it.
+
+    Args:
+        frame: Colour (h, w, 3) uint8; depth (h, w) [m], of any floating type, 0, NaN or infinity where there
+            is none.
+        camera: Says how large both are.
+
+    Returns:
+        The frame, its depth float32 and 0 where there is none.
+
+    Raises:
+        ValueError: Naming what is of another shape or type, and for depth that is not in metres.
+
+    >>> camera = Camera(1.0, 1.0, 0.0, 0.0, 2, 1)
+    >>> check_frame(Frame(np.zeros((1, 2, 3), np.uint8), np.array([[900, 2350]], np.uint16)), camera)
+    Traceback (most recent call last):
+    ValueError: depth: expected metres, floating point, got uint16 up to 2350: divide millimetres by 1000.0
+    """
+    size, (rgb, depth) = (camera.height, camera.width), map(np.asarray, frame)
+    if rgb.shape != (*size, 3) or rgb.dtype != np.uint8:
+        raise ValueError(f"rgb: expected shape {(*size, 3)} of uint8, got {rgb.shape} of {rgb.dtype}")
+    if depth.shape != size:
+        raise ValueError(f"depth: expected shape {size}, got {depth.shape}")
+    known = np.where(np.isfinite(depth), depth, 0) if depth.dtype.kind in "fiu" else depth
+    if depth.dtype.kind != "f" or known.max() > _FARTHEST_M:
+        got = f"{depth.dtype} up to {known.max():g}" if depth.dtype.kind in "fiu" else f"{depth.dtype}"
+        raise ValueError(f"depth: expected metres, floating point, got {got}: divide millimetres by 1000.0")
+    if known.min() < 0:
+        raise ValueError(f"depth: expected 0 or more, got {known.min():g}")
+    return Frame(rgb, known.astype(np.float32))
 
 
 def select(recording: Recording, indices: np.ndarray) -> Recording:

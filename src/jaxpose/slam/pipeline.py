@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxpose.datasets.types import Frame, Recording
+from jaxpose.datasets.types import Frame, Recording, check_frame
 from jaxpose.errors import DataError
 from jaxpose.fields import Params, PoseField, bspline, control_points_along, fit
 from jaxpose.geometry import rigid
@@ -198,7 +198,11 @@ def run(
         started, t = time.perf_counter(), float(recording.t[i])
         readings = _readings_until(recording.imu, state.frames.t[-1] if i else -np.inf, t)
         try:
-            state = _advance(state, recording.read(i), t, readings, recording.read)
+            frame = check_frame(recording.read(i), recording.camera)
+        except ValueError as error:
+            raise DataError(f"{recording.name}: frame {i}: {error}") from None
+        try:
+            state = _advance(state, frame, t, readings, recording.read)
         except DataError as error:
             raise DataError(f"{recording.name}: {error}") from None
         jax.block_until_ready(state.map)
@@ -363,19 +367,11 @@ def _kept_image(state: SlamState, index: int) -> Frame:
 
 def _checked(state: SlamState, rgb: np.ndarray, depth: np.ndarray, t: float) -> Frame:
     """The images of a frame as the pipeline has them; ValueError for what does not fit the run."""
-    rgb, depth = np.asarray(rgb), np.asarray(depth)
-    height, width = state.camera.height, state.camera.width
-    if rgb.shape != (height, width, 3) or rgb.dtype != np.uint8:
-        raise ValueError(f"slam.step: expected rgb ({height}, {width}, 3) uint8, got {rgb.shape} {rgb.dtype}")
-    if depth.shape != (height, width) or not np.issubdtype(depth.dtype, np.floating):
-        raise ValueError(
-            f"slam.step: expected depth ({height}, {width}) in metres, floating point, "
-            f"got {depth.shape} {depth.dtype}"
-        )
+    frame = check_frame(Frame(rgb, depth), state.camera)
     if not np.isfinite(t) or (state.frames.count and t <= state.frames.t[-1]):
         after = f" after {state.frames.t[-1]:.9g}" if state.frames.count else ""
         raise ValueError(f"slam.step: expected a time [s]{after}, got {t:.9g}")
-    return Frame(rgb, np.where(np.isfinite(depth), depth, 0).astype(np.float32))
+    return frame
 
 
 def _rigid(name: str, T: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:

@@ -16,8 +16,10 @@ from jaxpose.experiments.imu_slam import Config, main
 from jaxpose.experiments.slam.source import load
 from jaxpose.geometry.camera import Camera
 from jaxpose.slam.initial_pose import first_pose
+from jaxpose.slam.tracking.predict import readings_between
 
 T0_NS = 1_403_715_523_912_143_104  # of the first image, with ns that a float of seconds cannot hold
+FIRST_IMAGE_NS = 1_403_715_523_912_143_230  # as times.txt has it
 PERIOD_NS = 5_000_000
 FIRST = -20  # readings before the first image
 G = 9.80665
@@ -68,9 +70,9 @@ def test_both_layouts_give_the_same_readings(desk, walk):
     seconds = (np.arange(400) + FIRST) * 0.005
     text = desk / "imu.txt"
     np.savetxt(text, np.column_stack([seconds, omega, force]), fmt="%.17g", header="t w w w a a a")
-    for file, first in (desk / "imu.csv", T0_NS * 1e-9), (text, 0.0):
-        imu = read_imu(file)
-        np.testing.assert_allclose(imu.t - first, seconds, atol=5e-7)  # of 1970 a float knows 0.24 us
+    for file, t0_ns in (desk / "imu.csv", T0_NS), (text, 0):
+        imu = read_imu(file, t0_ns)
+        np.testing.assert_allclose(imu.t, seconds, rtol=0, atol=1e-9)
         np.testing.assert_array_equal(imu.omega_body, omega)
         np.testing.assert_array_equal(imu.acceleration_body, force)
 
@@ -78,8 +80,9 @@ def test_both_layouts_give_the_same_readings(desk, walk):
 def test_readings_are_on_the_clock_of_the_frames_wherever_tracking_starts(desk, walk):
     whole, later = load(config(desk)), load(config(desk, start=2))
     np.testing.assert_allclose(whole.recording.imu.t, (np.arange(400) + FIRST) * 0.005, atol=5e-7)
-    np.testing.assert_allclose(later.recording.imu.t, (np.arange(400) + FIRST) * 0.005 - 0.5, atol=5e-7)
-    assert later.recording.t0 == pytest.approx(T0_NS * 1e-9 + 0.5, abs=5e-7)
+    np.testing.assert_array_equal(later.recording.imu.t, whole.recording.imu.t)  # nothing is shifted again
+    np.testing.assert_array_equal(later.recording.t, whole.recording.t[2:])
+    assert later.recording.t0_ns == whole.recording.t0_ns == FIRST_IMAGE_NS
     np.testing.assert_array_equal(later.recording.imu.omega_body, readings(walk)[0])
     np.testing.assert_allclose(whole.recording.T_body_cam, MOUNTING, atol=1e-12)
     assert whole.imu == "200 Hz, of imu.csv, as read"
@@ -87,6 +90,22 @@ def test_readings_are_on_the_clock_of_the_frames_wherever_tracking_starts(desk, 
     moved = load(config(desk, imu_offset_s=-0.02))
     np.testing.assert_allclose(moved.recording.imu.t - whole.recording.imu.t, -0.02, atol=1e-9)
     assert "-0.02 s" in moved.imu
+
+
+def test_one_sample_from_its_file_to_the_tracker_has_one_time(desk):
+    """Whole ns in the file, seconds since the recording's origin from there on, wherever tracking starts."""
+    recording = load(config(desk, start=1, rate_hz=2.0)).recording
+    assert recording.imu is not None and recording.t.tolist() == [0.25, 0.75, 1.25]
+    row = -FIRST + 130  # 0.65 s after the first image
+    written_ns = times_ns()[row]
+    assert recording.imu.t[row] == pytest.approx((written_ns - recording.t0_ns) * 1e-9, abs=1e-15)
+    start, end = recording.t[:2]
+    held = readings_between(recording.imu, start, end, np.eye(3), np.zeros(3), recording.gravity_world)
+    inside = np.flatnonzero((recording.imu.t > start) & (recording.imu.t < end))
+    k = 1 + int(np.flatnonzero(inside == row)[0])  # the first place is the frame's own
+    frame_ns = recording.t0_ns + 250_000_000
+    assert held.imu.t[k] == pytest.approx((written_ns - frame_ns) * 1e-9, abs=1e-8)
+    np.testing.assert_allclose(held.imu.omega_body[k], recording.imu.omega_body[row], rtol=1e-6)
 
 
 def test_a_mounting_is_16_numbers_or_a_data_sheet(desk):
@@ -100,12 +119,12 @@ def test_a_mounting_is_16_numbers_or_a_data_sheet(desk):
 @pytest.mark.parametrize(
     "text, message",
     [
-        ("1 0 0\n", "expected T_BS, or the 16 numbers of a 4x4 T_body_cam, got 3 finite numbers"),
+        ("1 0 0\n", "expected T_BS, or the 16 numbers of a 4x4 T_body_cam, got '1 0 0'"),
         ("camera: left\n", "expected T_BS, or the 16 numbers of a 4x4 T_body_cam, got 'camera: left'"),
         ("T_BS:\n  data: [1, 0]\n", "expected T_BS with 16 numbers, got '1, 0'"),
         ("2 0 0 0  0 1 0 0  0 0 1 0  0 0 0 1", "expected a rotation, got a matrix 1 off one"),
         ("1 0 0 0  0 1 0 0  0 0 1 0  1 2 3 1", "expected a last row 0 0 0 1, got 1 2 3 1"),
-        ("nan 0 0 0  0 1 0 0  0 0 1 0  0 0 0 1", "got 15 finite numbers"),
+        ("nan 0 0 0  0 1 0 0  0 0 1 0  0 0 0 1", "got 'nan 0 0 0 0 1 0 0"),
     ],
 )
 def test_a_mounting_that_is_none_is_named(tmp_path, text, message):

@@ -9,12 +9,13 @@ from jaxtyping import Float
 from jaxpose.cli.check.findings import Checked, Fact, Finding, join, unusable
 from jaxpose.cli.check.imu import check_imu
 from jaxpose.cli.check.poses import Quaternions, check_poses
-from jaxpose.cli.check.timestamps import check_stamps, read_table
+from jaxpose.cli.check.timestamps import check_stamps
 from jaxpose.datasets.images import found
 from jaxpose.datasets.rgbd import euroc
 from jaxpose.datasets.rgbd.euroc_files import sensors
 from jaxpose.errors import DataError
 from jaxpose.files import trajectories
+from jaxpose.files.tables import read_unchecked
 
 _TRUTHS = ("state_groundtruth_estimate0", "mocap0")  # of EuRoC, of TUM-VI
 _FILES: dict[str, Literal["note", "warning"]] = {
@@ -36,7 +37,7 @@ def check_inertial(path: Path) -> Checked:
     mav0, parts = sensors(path), []
     for name, gaps in _FILES.items():
         file = mav0 / name / "data.csv"
-        if file.is_file() and (table := read_table(file)).size:
+        if file.is_file() and (table := read_unchecked(file)).size:
             parts.append(check_stamps(name, table[:, 0] * 1e-9, "ns", gaps=gaps))
     log = None
     try:
@@ -83,6 +84,6 @@ def _truth(
     if shared <= 0:
         fix = "check that both are of one recording, by one clock"
         findings = (Finding("warning", "ground_truth", text, "ground truth while the IMU reads", fix),)
-    table = read_table(file)
+    table = read_unchecked(file)
     values = table[np.append(True, np.diff(table[:, 0]) != 0), 4:8]
     return join([Checked((fact,), findings), check_poses(t, T, Quaternions(values, "wxyz"))])

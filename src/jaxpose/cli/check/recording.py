@@ -12,10 +12,11 @@ from jaxpose.cli.check.findings import Checked, Fact, Finding, join, unusable
 from jaxpose.cli.check.inertial import check_inertial
 from jaxpose.cli.check.poses import check_poses
 from jaxpose.cli.check.reprojection import check_reprojection
-from jaxpose.cli.check.timestamps import check_stamps, read_table
+from jaxpose.cli.check.timestamps import check_stamps
 from jaxpose.datasets.rgbd import registry as rgbd_registry
 from jaxpose.datasets.types import Recording
 from jaxpose.errors import DataError
+from jaxpose.files.tables import read_unchecked
 from jaxpose.geometry.camera import Camera, angle_of_view
 
 _STAMPS = {"tum": ("rgb.txt", "depth.txt", "groundtruth.txt"), "plain": ("times.txt",)}
@@ -30,7 +31,7 @@ def check_recording(path: Path, form: rgbd_registry.Format) -> Checked:
     """Everything that is tested of a recording in the layout `form`, images looked at here and there only."""
     parts = []
     for name in _STAMPS.get(form, ()):
-        if (path / name).is_file() and (table := read_table(path / name)).size:
+        if (path / name).is_file() and (table := read_unchecked(path / name)).size:
             ground_truth = name == "groundtruth.txt"
             parts.append(check_stamps(name, table[:, 0], gaps="note" if ground_truth else "warning"))
     if form == "euroc":
@@ -75,7 +76,7 @@ def _stamped(path: Path, form: rgbd_registry.Format) -> bool:
     if form != "plain":
         return form in ("tum", "euroc")
     poses = path / "poses.txt"
-    return (path / "times.txt").is_file() or (poses.is_file() and read_table(poses).shape[1] == 8)
+    return (path / "times.txt").is_file() or (poses.is_file() and read_unchecked(poses).shape[1] == 8)
 
 
 def _frames(recording: Recording, stamped: bool) -> Checked:

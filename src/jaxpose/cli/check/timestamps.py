@@ -1,6 +1,5 @@
 """Tests of timestamps: their order, their unit, and the gaps between them."""
 
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -15,23 +14,6 @@ _PLAUSIBLE_HZ = (0.1, 1e4)  # of what is recorded by a camera, an IMU or motion 
 _USUAL_HZ = (0.5, 2e3)
 _SINCE_1970 = (1e8, 4e9)  # s, from 1973 to 2096
 _WHOLE_PERIOD = 2.0  # s: timestamps that are all whole numbers so far apart count something else
-
-
-def read_table(file: Path) -> Float[np.ndarray, "n c"]:
-    """The numbers of a text file whose lines have as many as its first, without checks; empty if none."""
-    rows = []
-    for line in file.read_text("utf-8-sig", "replace").splitlines():
-        if not line.strip() or line.lstrip().startswith("#"):
-            continue
-        numbers = []
-        for word in line.replace(",", " ").split():
-            try:
-                numbers.append(float(word))
-            except ValueError:
-                break
-        if not rows or len(numbers) == len(rows[0]):
-            rows.append(numbers)
-    return np.array(rows).reshape(len(rows), -1)
 
 
 def check_stamps(

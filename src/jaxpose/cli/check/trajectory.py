@@ -6,30 +6,31 @@ import numpy as np
 
 from jaxpose.cli.check.findings import Checked, Fact, join, unusable
 from jaxpose.cli.check.poses import Quaternions, check_poses
-from jaxpose.cli.check.timestamps import check_stamps, read_table
+from jaxpose.cli.check.timestamps import check_stamps
 from jaxpose.datasets.images import some
 from jaxpose.errors import DataError
-from jaxpose.files import trajectory_reader
+from jaxpose.files import trajectories
+from jaxpose.files.tables import read_unchecked
 
 _SUFFIXES = (".txt", ".csv", ".tum", ".kitti")
 
 
 def check_trajectory(file: Path) -> tuple[str, Checked]:
     """The format of a file of poses, and what is tested of it; DataError for what is no trajectory at all."""
-    table = read_table(file)
+    table = read_unchecked(file)
     form, stamped, parts = "", False, []
     if table.size and table.shape[1] in (8, 17):
         commas = any("," in line for line in _head(file))
         form, stamped, unit = ("EuRoC", True, "ns") if commas else ("TUM", True, "s")
         parts.append(check_stamps("poses", table[:, 0] * (1e-9 if commas else 1.0), unit, gaps="note"))
     try:
-        found = trajectory_reader.read_trajectory(file)
+        found = trajectories.read_trajectory(file)
     except DataError as error:
         if not form:
             raise
         return form, join([*parts, unusable(error)])
     t, T = found.trajectory
-    if not found.stamped:
+    if not found.has_timestamps:
         fact = Fact("poses", f"{len(t)}, no timestamps", {"count": len(t)})
         return found.format, join([Checked((fact,)), check_poses(None, T)])
     order = "wxyz" if found.format == "EuRoC" else "xyzw"

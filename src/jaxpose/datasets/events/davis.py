@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import NoReturn
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxpose.datasets.events.sidecar import Source, load_source, with_camera
 from jaxpose.datasets.events.stream import BLOCK, Block, Stream, Unit
 from jaxpose.datasets.ground_truth import poses_at
 from jaxpose.datasets.images import image_size, only, some
 from jaxpose.datasets.photos.common import extent_depths, read_images
-from jaxpose.datasets.rgbd.tum import Stamped, read_list
+from jaxpose.datasets.rgbd.tum import read_list
 from jaxpose.datasets.types import EventRecording, Photographs
 from jaxpose.errors import DataError
 from jaxpose.events import Mosaic
@@ -55,7 +56,7 @@ def load(
     if not (folder / "images.txt").is_file():
         return recording
     images = read_list(folder / "images.txt")
-    frames, notes = _frames(folder, images._replace(t=images.t - zero_s), recording)
+    frames, notes = _frames(folder, images.t - zero_s, images.files, recording)
     return recording._replace(frames=frames, notes=(*recording.notes, *notes))
 
 
@@ -134,10 +135,10 @@ def _name_line(file: Path, error: ValueError) -> NoReturn:
 
 
 def _frames(
-    folder: Path, images: Stamped, recording: EventRecording
+    folder: Path, t: Float[np.ndarray, " n"], images: list[Path], recording: EventRecording
 ) -> tuple[Photographs | None, tuple[str, ...]]:
     """The images next to and during the events that have a pose, and notes on the others."""
-    t, events = images.t, recording.events.t
+    events = recording.events.t
     first = max(int(np.searchsorted(t, events[0], "right")) - 1, 0)
     near = np.arange(first, min(int(np.searchsorted(t, events[-1])) + 1, len(t)))
     poses = poses_at(Trajectory(recording.t, recording.T_world_cam), t[near])
@@ -148,7 +149,7 @@ def _frames(
             f"{len(t) - len(near)} of {len(t)} frames left out, not next to or within the events' time"
         )
     if not posed.all():
-        names = [images.files[i].name for i in near[~posed]]
+        names = [images[i].name for i in near[~posed]]
         notes.append(f"{len(names)} frames left out, no true pose around their timestamp: {some(names)}")
     rows = near[posed]
     if not len(rows):
@@ -157,7 +158,7 @@ def _frames(
     notes.append(
         f"near {depths[0]:.3g} and far {depths[1]:.3g} of the frames are guessed from the cameras' extent"
     )
-    files = [images.files[i] for i in rows]
+    files = [images[i] for i in rows]
     rgb, _, camera = read_images(files, recording.camera, stated="the size of the first", width=None)
     frames = Photographs(
         name=recording.name,

@@ -16,6 +16,7 @@ from jaxpose.datasets.photos.common import check_poses, frame_numbers, read_imag
 from jaxpose.datasets.types import EventRecording, Photographs
 from jaxpose.errors import DataError
 from jaxpose.events import Events, Mosaic
+from jaxpose.files.tables import read_all_numbers
 from jaxpose.geometry import rigid
 from jaxpose.geometry.camera import Camera
 
@@ -157,16 +158,7 @@ def _files(folder: Path, suffixes: Sequence[str]) -> list[Path]:
 
 
 def _numbers(file: Path, counts: tuple[int, ...]) -> Float[np.ndarray, " n"]:
-    """The finite numbers of a file, whatever its lines."""
-    words = file.read_text("utf-8-sig", "replace").split()
-    try:
-        numbers = np.array([float(word) for word in words])
-    except ValueError:
-        numbers = np.zeros(0)
-    if len(numbers) not in counts or not np.isfinite(numbers).all():
-        wanted = " or ".join(map(str, counts))
-        raise DataError(f"{file}: expected {wanted} finite numbers, got {' '.join(words)[:60]!r}")
-    return numbers
+    return read_all_numbers(file, counts, f"{' or '.join(map(str, counts))} finite numbers")
 
 
 def _camera(files: Sequence[Path], size: tuple[int, int]) -> Camera:

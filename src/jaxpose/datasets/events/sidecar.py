@@ -14,8 +14,7 @@ from jaxpose.errors import DataError
 from jaxpose.events import Mosaic
 from jaxpose.files.camera_json import read_camera
 from jaxpose.files.tables import read_numbers
-from jaxpose.files.trajectories import Trajectory
-from jaxpose.files.trajectory_reader import read_trajectory
+from jaxpose.files.trajectories import Trajectory, read_trajectory
 from jaxpose.geometry.camera import Camera
 
 # Width and height of event cameras: DVS128, DAVIS240, ATIS, DAVIS346, VGA (Prophesee, DSEC), 720p.

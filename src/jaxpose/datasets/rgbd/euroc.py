@@ -29,12 +29,12 @@ from jaxpose.datasets.rgbd.euroc_files import (
     read_csv,
     read_imu_sheet,
     read_listing,
-    seconds,
     sensors,
 )
 from jaxpose.datasets.types import Frame, Recording
 from jaxpose.errors import DataError
 from jaxpose.files.ply import read_points
+from jaxpose.files.tables import seconds
 from jaxpose.files.trajectories import Trajectory
 from jaxpose.geometry import rigid
 from jaxpose.geometry.camera import Camera
@@ -46,18 +46,18 @@ _TRUTH_COLUMNS = (
 
 
 class ImuLog(NamedTuple):
-    """Readings in seconds since the first, the noise of `sensor.yaml`, and where the sensor sits."""
+    """Readings, the noise of `sensor.yaml`, and where the sensor sits."""
 
-    imu: Imu
+    imu: Imu  # [s] since `t0_ns`
     noise: ImuNoise
-    t0_ns: int
+    t0_ns: int  # since 1970
     T_body_imu: Float[np.ndarray, "4 4"]
 
 
 class GroundTruth(NamedTuple):
-    """Motion capture fused with the IMU; seconds on the clock of `load_imu`, SI units, body = IMU."""
+    """Motion capture fused with the IMU; SI units, body = IMU."""
 
-    t: Float[np.ndarray, " n"]
+    t: Float[np.ndarray, " n"]  # [s] since the first IMU timestamp
     T_world_body: Float[np.ndarray, "n 4 4"]
     velocity_world: Float[np.ndarray, "n 3"]
     gyro_bias: Float[np.ndarray, "n 3"]
@@ -101,12 +101,13 @@ def load(path: Path | str) -> Recording:
     cannot be used.
     """
     mav0 = sensors(path)
-    cam0, log = load_camera(mav0), load_imu(mav0)
-    t = seconds(cam0.stamps_ns, log.t0_ns)
-    T_world_body, untrue = _truth_at(mav0, t)
+    cam0 = load_camera(mav0)
+    T_world_body, untrue = _truth_at(mav0, cam0.stamps_ns)
     T_world_cam = T_world_body @ cam0.T_body_cam
     depth = _find_depth(mav0, cam0, T_world_cam)
     rows = depth.rows
+    t0_ns = cam0.stamps_ns[rows[0]]
+    log = load_imu(mav0, t0_ns)
     names = [str(cam0.stamps_ns[row]) for row in rows]
     if untrue:
         poses, lacking = None, untrue
@@ -118,13 +119,13 @@ def load(path: Path | str) -> Recording:
     return Recording(
         name=(mav0.resolve().parent if mav0.resolve().name == "mav0" else mav0.resolve()).name,
         camera=cam0.camera,
-        t=seconds([cam0.stamps_ns[row] for row in rows], cam0.stamps_ns[rows[0]]),
+        t=seconds([cam0.stamps_ns[row] for row in rows], t0_ns),
         read=lambda i: Frame(read_color(cam0.files[rows[i]]), depth.read(rows[i])),
         T_world_cam=poses,
-        imu=log.imu._replace(t=np.asarray(log.imu.t) - t[rows[0]]),
+        imu=log.imu,
         T_body_cam=rigid.inverse(log.T_body_imu) @ cam0.T_body_cam,
         notes=(*depth.notes, *lacking, *_unused(mav0)),
-        t0=cam0.stamps_ns[rows[0]] * 1e-9,
+        t0_ns=t0_ns,
         files=within([cam0.files[row] for row in rows], path),
     )
 
@@ -143,23 +144,45 @@ def load_camera(path: Path | str, name: str = "cam0") -> CameraLog:
     return CameraLog(camera, timestamps, files, T_body_cam)
 
 
-def load_imu(path: Path | str) -> ImuLog:
-    """Read `mav0/imu0` of the sequence folder `path`; DataError for files that cannot be used."""
+def load_imu(path: Path | str, t0_ns: int | None = None) -> ImuLog:
+    """Read `mav0/imu0` of a sequence folder.
+
+    Args:
+        path: The sequence folder, or its `mav0`.
+        t0_ns: Where time is 0 [ns since 1970]; by default at the first reading.
+
+    Returns:
+        The readings as recorded, and the sensor's data sheet.
+
+    Raises:
+        DataError: For files that cannot be used.
+    """
     folder = sensors(path) / "imu0"
-    timestamps, values, _ = read_csv(folder / "data.csv", IMU_COLUMNS)
+    table = read_csv(folder / "data.csv", IMU_COLUMNS)
     noise, T_body_imu = read_imu_sheet(folder / "sensor.yaml")
-    imu = Imu(seconds(timestamps, timestamps[0]), values[:, :3], values[:, 3:])
-    return ImuLog(imu, noise, timestamps[0], T_body_imu)
+    t0_ns = table.ns[0] if t0_ns is None else t0_ns
+    imu = Imu(seconds(table.ns, t0_ns), table.values[:, :3], table.values[:, 3:])
+    return ImuLog(imu, noise, t0_ns, T_body_imu)
 
 
-def load_truth(path: Path | str) -> GroundTruth:
-    """Read `mav0/state_groundtruth_estimate0` of the folder `path`; DataError as `load_imu`.
+def load_truth(path: Path | str, t0_ns: int | None = None) -> GroundTruth:
+    """Read `mav0/state_groundtruth_estimate0` of a sequence folder.
 
-    Its time starts at the first IMU timestamp, hence the IMU's file has to be there too.
+    Args:
+        path: The sequence folder, or its `mav0`.
+        t0_ns: Where time is 0 [ns since 1970]; by default at the first reading of the IMU, whose file has to
+            be there then.
+
+    Returns:
+        The motion of the body, and the biases of its IMU.
+
+    Raises:
+        DataError: For files that cannot be used.
     """
     file = sensors(path) / "state_groundtruth_estimate0" / "data.csv"
-    timestamps, values, lines = read_csv(file, _TRUTH_COLUMNS)
-    t0_ns = read_csv(sensors(path) / "imu0" / "data.csv", IMU_COLUMNS, rows=1)[0][0]
+    lines, timestamps, values = read_csv(file, _TRUTH_COLUMNS)
+    if t0_ns is None:
+        t0_ns = read_csv(sensors(path) / "imu0" / "data.csv", IMU_COLUMNS, rows=1).ns[0]
     norm = np.linalg.norm(values[:, 3:7], axis=1)
     if abs(norm - 1).max() > 1e-2:
         row = int(abs(norm - 1).argmax())
@@ -170,13 +193,35 @@ def load_truth(path: Path | str) -> GroundTruth:
     )
 
 
-def _truth_at(mav0: Path, t: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarray, "n 4 4"], tuple[str, ...]]:
-    """T_world_body at times on the IMU's clock, NaN where ground truth has a gap; a note if there is none."""
+def common_start(path: Path | str) -> tuple[int, float]:
+    """When both IMU and ground truth of a sequence begin.
+
+    Args:
+        path: The sequence folder, or its `mav0`.
+
+    Returns:
+        The later of their first timestamps [ns since 1970], and how long [s] after the IMU's that is.
+
+    Raises:
+        DataError: For files that cannot be used.
+    """
+    imu, ground_truth = (
+        read_csv(sensors(path) / name / "data.csv", columns, rows=1).ns[0]
+        for name, columns in (("imu0", IMU_COLUMNS), ("state_groundtruth_estimate0", _TRUTH_COLUMNS))
+    )
+    t0_ns = max(imu, ground_truth)
+    return t0_ns, (t0_ns - imu) * 1e-9
+
+
+def _truth_at(mav0: Path, stamps_ns: list[int]) -> tuple[Float[np.ndarray, "n 4 4"], tuple[str, ...]]:
+    """T_world_body at timestamps, NaN where ground truth has a gap; a note if there is none."""
     if not (mav0 / "state_groundtruth_estimate0").is_dir():
-        none = np.full((len(t), 4, 4), np.nan)
+        none = np.full((len(stamps_ns), 4, 4), np.nan)
         return none, ("no state_groundtruth_estimate0: there is no ground truth to compare with",)
-    ground_truth = load_truth(mav0)
-    return poses_at(Trajectory(ground_truth.t, ground_truth.T_world_body), t), ()
+    t0_ns = stamps_ns[0]
+    ground_truth = load_truth(mav0, t0_ns)
+    trajectory = Trajectory(ground_truth.t, ground_truth.T_world_body)
+    return poses_at(trajectory, seconds(stamps_ns, t0_ns)), ()
 
 
 def _find_depth(mav0: Path, cam0: CameraLog, T_world_cam: Float[np.ndarray, "n 4 4"]) -> _Depth:

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxpose.errors import DataError
+from jaxpose.files.tables import StampedRows, read_stamped, read_stamped_names
 from jaxpose.geometry.camera import Camera
 from jaxpose.imu import ImuNoise
 
@@ -22,66 +23,22 @@ def sensors(path: Path | str) -> Path:
     return path / "mav0" if (path / "mav0").is_dir() else path
 
 
-def seconds(timestamps: list[int], t0_ns: int) -> Float[np.ndarray, " n"]:
-    """Nanoseconds since 1970 need 61 bits, a float has 53: subtract as integers, then convert."""
-    return np.array([timestamp - t0_ns for timestamp in timestamps]) * 1e-9
-
-
-def _read_text(file: Path) -> str:
+def _existing(file: Path) -> Path:
     if not file.is_file():
         raise DataError(f"{file}: expected a file, got none")
-    return file.read_text(encoding="utf-8-sig", errors="replace")
+    return file
 
 
-def read_csv(
-    file: Path, columns: str, rows: int | None = None
-) -> tuple[list[int], Float[np.ndarray, "n c"], list[int]]:
-    """Timestamps [ns], other columns and line numbers of the first `rows` rows; errors name `columns`."""
+def read_csv(file: Path, columns: str, rows: int | None = None) -> StampedRows:
+    """Timestamps, other columns and line numbers of the first `rows` rows; errors name `columns`."""
     count = int(columns.split()[0])
-    timestamps, values, lines = [], [], []
-    for number, line in enumerate(_read_text(file).splitlines(), start=1):
-        if not line.strip() or line.lstrip().startswith("#"):
-            continue
-        fields = line.split(",")
-        if len(fields) != count:
-            raise DataError(f"{file}:{number}: expected {columns}, got {len(fields)}")
-        try:
-            timestamp, row = int(fields[0]), [float(field) for field in fields[1:]]
-        except ValueError:
-            raise DataError(
-                f"{file}:{number}: expected a timestamp in ns and numbers, got {line[:60]!r}"
-            ) from None
-        if not all(map(math.isfinite, row)):
-            raise DataError(f"{file}:{number}: expected finite numbers, got {line[:60]!r}")
-        if timestamps and timestamp <= timestamps[-1]:
-            raise DataError(f"{file}:{number}: expected a timestamp after {timestamps[-1]}, got {timestamp}")
-        timestamps.append(timestamp)
-        values.append(row)
-        lines.append(number)
-        if len(timestamps) == rows:
-            break
-    if not timestamps:
-        raise DataError(f"{file}: expected lines of {columns}, got none")
-    return timestamps, np.array(values), lines
+    return read_stamped(_existing(file), columns, count, unit="ns", separator=",", rows=rows)
 
 
 def read_listing(folder: Path) -> tuple[list[int], list[Path]]:
     """Timestamps [ns] and image files of `data.csv`, lines of timestamp and file name."""
-    file = folder / "data.csv"
-    timestamps, files = [], []
-    for number, line in enumerate(_read_text(file).splitlines(), start=1):
-        if not line.strip() or line.lstrip().startswith("#"):
-            continue
-        timestamp, _, name = (field.strip() for field in line.partition(","))
-        if not (timestamp.isdecimal() and name):
-            raise DataError(f"{file}:{number}: expected a timestamp in ns and a file name, got {line[:60]!r}")
-        if timestamps and int(timestamp) <= timestamps[-1]:
-            raise DataError(f"{file}:{number}: expected a timestamp after {timestamps[-1]}, got {timestamp}")
-        timestamps.append(int(timestamp))
-        files.append(folder / "data" / name)
-    if not timestamps:
-        raise DataError(f"{file}: expected lines of a timestamp and a file name, got none")
-    return timestamps, files
+    timestamps, names = read_stamped_names(_existing(folder / "data.csv"), unit="ns", separator=",")
+    return timestamps, [folder / "data" / name for name in names]
 
 
 def read_imu_sheet(file: Path) -> tuple[ImuNoise, Float[np.ndarray, "4 4"]]:
@@ -113,7 +70,7 @@ def read_camera_sheet(file: Path) -> tuple[Camera, Float[np.ndarray, "4 4"]]:
 
 def _read_yaml(file: Path) -> str:
     """The text without comments: a few keys of a fixed layout do not need a YAML package."""
-    return re.sub("#.*", "", _read_text(file))
+    return re.sub("#.*", "", _existing(file).read_text(encoding="utf-8-sig", errors="replace"))
 
 
 def read_extrinsics(file: Path) -> Float[np.ndarray, "4 4"]:

@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from jaxpose.datasets.rgbd.euroc_files import IMU_COLUMNS, read_csv, read_extrinsics, seconds
+from jaxpose.datasets.rgbd.euroc_files import IMU_COLUMNS, read_csv, read_extrinsics
 from jaxpose.datasets.types import Recording
 from jaxpose.errors import DataError
-from jaxpose.files.tables import read_numbers
+from jaxpose.files.tables import numbered_lines, read_all_numbers, read_stamped, seconds
 from jaxpose.files.trajectories import orthonormal
 from jaxpose.geometry import rigid
 from jaxpose.imu import Imu
@@ -17,65 +17,68 @@ from jaxpose.imu.gravity import gravity_note
 _TEXT_COLUMNS = "7 numbers (t wx wy wz ax ay az)"
 
 
-def read_imu(file: Path | str) -> Imu:
-    """Read raw readings [rad/s, m/s^2, gravity in them] with timestamps [s] on the file's own clock.
+def read_imu(file: Path | str, t0_ns: int = 0) -> Imu:
+    """Read raw readings: with commas lines of EuRoC's `imu0/data.csv`, with blanks `t wx wy wz ax ay az`.
 
-    With commas a line is that of EuRoC's `imu0/data.csv`, its timestamp in whole ns; with blanks it is
-    `t wx wy wz ax ay az`, t in seconds. DataError naming file and line for anything else, for text or NaN,
-    for timestamps that repeat or go backwards, and for fewer than two readings; FileNotFoundError as usual.
+    Args:
+        file: Its timestamps are whole ns where lines have commas, else decimal seconds.
+        t0_ns: Where time is 0 [ns] on the file's own clock.
+
+    Returns:
+        Readings [rad/s, m/s^2, gravity in them] with float64 seconds since `t0_ns`.
+
+    Raises:
+        DataError: Naming file and line for anything else, for text or NaN, for timestamps that repeat or go
+            backwards, and for fewer than two readings.
     """
     file = Path(file)
-    text = file.read_text(encoding="utf-8-sig", errors="replace").splitlines()
-    first = next((line for line in text if line.strip() and not line.lstrip().startswith("#")), "")
-    if "," in first:
-        timestamps, values, _ = read_csv(file, IMU_COLUMNS)
-        t = seconds(timestamps, 0)
+    if "," in next((line for _, line in numbered_lines(file)), ""):
+        _, ns, values = read_csv(file, IMU_COLUMNS)
     else:
-        lines, table = read_numbers(file, _TEXT_COLUMNS, (7,))
-        t, values = table[:, 0], table[:, 1:]
-        for row in np.flatnonzero(np.diff(t) <= 0) + 1:
-            raise DataError(
-                f"{file}:{lines[row]}: expected a timestamp after {t[row - 1]!s} s, got {t[row]!s} s"
-            )
-    if len(t) < 2:
-        raise DataError(f"{file}: expected at least 2 readings, got {len(t)}")
-    return Imu(t, values[:, :3], values[:, 3:])
+        _, ns, values = read_stamped(file, _TEXT_COLUMNS, 7, unit="s")
+    if len(ns) < 2:
+        raise DataError(f"{file}: expected at least 2 readings, got {len(ns)}")
+    return Imu(seconds(ns, t0_ns), values[:, :3], values[:, 3:])
 
 
 def read_mounting(file: Path | str) -> Float[np.ndarray, "4 4"]:
-    """Read `T_body_cam`, the camera's pose on the IMU: `T_BS` of EuRoC's `cam0/sensor.yaml`, or 16 numbers.
+    """Read where the camera is on the IMU: `T_BS` of EuRoC's `cam0/sensor.yaml`, or 16 numbers.
 
-    DataError naming the file for another count, for NaN, and for what is no rigid transform.
+    Args:
+        file: A data sheet, or a file with the numbers of a 4x4 matrix.
+
+    Returns:
+        `T_body_cam`, its rotation orthonormal.
+
+    Raises:
+        DataError: Naming the file for another count, for NaN, and for what is no rigid transform.
     """
     file = Path(file)
-    text = file.read_text(encoding="utf-8-sig", errors="replace")
-    if "T_BS" in text:
+    if any(line.startswith("T_BS") for _, line in numbered_lines(file)):
         T = read_extrinsics(file)
     else:
-        text = " ".join(line.partition("#")[0] for line in text.splitlines())
-        wanted = "T_BS, or the 16 numbers of a 4x4 T_body_cam"
-        try:
-            T = np.array([float(word) for word in text.replace(",", " ").split()])
-        except ValueError:
-            raise DataError(f"{file}: expected {wanted}, got {' '.join(text.split())[:60]!r}") from None
-        if T.size != 16 or not np.isfinite(T).all():
-            raise DataError(f"{file}: expected {wanted}, got {np.isfinite(T).sum()} finite numbers")
-        T = T.reshape(4, 4)
+        T = read_all_numbers(file, (16,), "T_BS, or the 16 numbers of a 4x4 T_body_cam").reshape(4, 4)
     if np.abs(T[3] - [0, 0, 0, 1]).max() > 1e-6:
         raise DataError(f"{file}: expected a last row 0 0 0 1, got {' '.join(f'{x:g}' for x in T[3])}")
     return orthonormal(T[None], lambda _: str(file))[0]
 
 
 def with_imu(recording: Recording, readings: Path | str, mounting: Path | str) -> Recording:
-    """The recording with the IMU of `readings` in place of any it has, at `mounting` from the camera.
+    """The recording with the IMU of a file in place of any it has.
 
-    Timestamps count on the clock of the recording's own files; of one without timestamps, from its first
-    frame.
+    Args:
+        recording: Its `t0_ns` is on the clock of the readings; 0 for one without timestamps, whose readings
+            then count from its first frame.
+        readings: A file for `read_imu`.
+        mounting: A file for `read_mounting`.
+
+    Returns:
+        The recording with `imu` and `T_body_cam`.
+
+    Raises:
+        DataError: As the two.
     """
-    imu = read_imu(readings)
-    return recording._replace(
-        imu=imu._replace(t=np.asarray(imu.t) - recording.t0), T_body_cam=read_mounting(mounting)
-    )
+    return recording._replace(imu=read_imu(readings, recording.t0_ns), T_body_cam=read_mounting(mounting))
 
 
 def imu_notes(recording: Recording, name: Path | str) -> tuple[str, ...]:
@@ -85,10 +88,8 @@ def imu_notes(recording: Recording, name: Path | str) -> tuple[str, ...]:
     """
     assert recording.imu is not None
     t, at = recording.t, np.asarray(recording.imu.t)
-    spans = [
-        f"{first + recording.t0:.3f} to {last + recording.t0:.3f} s"
-        for first, last in (t[[0, -1]], at[[0, -1]])
-    ]
+    t0 = recording.t0_ns * 1e-9
+    spans = [f"{first + t0:.3f} to {last + t0:.3f} s" for first, last in (t[[0, -1]], at[[0, -1]])]
     inside = (t >= at[0]) & (t <= at[-1])
     if not inside.any():
         raise DataError(f"{name}: expected readings at the frames, {spans[0]}, got {spans[1]}")

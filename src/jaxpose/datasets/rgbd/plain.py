@@ -31,7 +31,7 @@ from jaxpose.datasets.images import (
 )
 from jaxpose.datasets.types import Frame, Recording
 from jaxpose.errors import DataError
-from jaxpose.files.tables import read_numbers
+from jaxpose.files.tables import numbered_lines, read_numbers, read_stamped, seconds
 from jaxpose.files.trajectories import nearest, read_kitti, read_tum
 from jaxpose.geometry.camera import Camera
 
@@ -77,7 +77,8 @@ def load(path: Path | str, *, rate_hz: float = 30.0, depth_per_metre: float | No
     assumed = () if depth_per_metre or stated_per_metre else ("no depth_scale: took depth as mm",)
     check_depth(folder, depths, per_metre)
     read_color(colors[0])
-    t, ground_truth = _times_and_poses(folder, len(all_colors), rate_hz)
+    ns, ground_truth = _times_and_poses(folder, len(all_colors), rate_hz)
+    ns = [ns[row] for row in rows]
     if ground_truth is None:
         poses, lacking = None, ("no poses.txt: there is no ground truth to compare with",)
     else:
@@ -91,11 +92,11 @@ def load(path: Path | str, *, rate_hz: float = 30.0, depth_per_metre: float | No
     return Recording(
         name=name_of(folder),
         camera=Camera(*pinhole, *size),
-        t=t[rows] - t[rows[0]],
+        t=seconds(ns, ns[0]),
         read=lambda i: Frame(read_color(colors[i]), read_depth(depths[i], per_metre)),
         T_world_cam=poses,
         notes=(*paired, *assumed, *lacking),
-        t0=float(t[rows[0]]),
+        t0_ns=ns[0],
         files=within(colors, path),
     )
 
@@ -156,50 +157,51 @@ def _intrinsics(folder: Path, size: tuple[int, int]) -> _Stated:
 
 def _times_and_poses(
     folder: Path, count: int, rate_hz: float
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 4 4"] | None]:
-    """Times [s] of all colour images, and their poses."""
-    t = _read_times(folder / "times.txt", count)
+) -> tuple[list[int], Float[np.ndarray, "n 4 4"] | None]:
+    """Times [ns] of all colour images, and their poses."""
+    ns = _read_times(folder / "times.txt", count)
     file = folder / "poses.txt"
     columns = _columns(file) if file.is_file() else 0
     if columns == 8:
-        trajectory = read_tum(file, first_of_repeated=t is not None)
-        if t is None:
+        trajectory = read_tum(file, first_of_repeated=ns is not None)
+        if ns is None:
             _check_count(file, len(trajectory.t), count)
-            return trajectory.t, trajectory.T
+            return _whole_ns(trajectory.t), trajectory.T
+        t = np.array(ns, np.float64) / 1e9
         row = nearest(t, trajectory.t)
         near = np.abs(trajectory.t[row] - t) <= _MOST_APART_S
-        return t, np.where(near[:, None, None], trajectory.T[row], np.nan)
-    if t is None:
-        t = frame_times(range(count), rate_hz)
+        return ns, np.where(near[:, None, None], trajectory.T[row], np.nan)
+    if ns is None:
+        ns = _whole_ns(frame_times(range(count), rate_hz))
     if columns == 0:
-        return t, None
+        return ns, None
     if columns == 12:
         T = read_kitti(file).T
     else:
         T = read_numbers(file, _POSE_COLUMNS, (16,), finite=False)[1].reshape(-1, 4, 4)
     _check_count(file, len(T), count)
-    return t, T
+    return ns, T
 
 
-def _read_times(file: Path, count: int) -> Float[np.ndarray, " n"] | None:
-    """Increasing timestamps, one for each colour image; None without a file."""
+def _whole_ns(t: Float[np.ndarray, " n"]) -> list[int]:
+    return [round(s * 1e9) for s in t.tolist()]
+
+
+def _read_times(file: Path, count: int) -> list[int] | None:
+    """Increasing timestamps [ns], one for each colour image; None without a file."""
     if not file.is_file():
         return None
-    lines, values = read_numbers(file, "1 number (a timestamp in seconds)", (1,))
-    _check_count(file, len(values), count)
-    t = values[:, 0]
-    for row in np.flatnonzero(np.diff(t) <= 0) + 1:
-        raise DataError(f"{file}:{lines[row]}: expected a timestamp after {t[row - 1]:g} s, got {t[row]:g} s")
-    return t
+    ns = read_stamped(file, "1 number (a timestamp in seconds)", 1, unit="s").ns
+    _check_count(file, len(ns), count)
+    return ns
 
 
 def _columns(file: Path) -> int:
     """How many numbers the first line of a file of poses has."""
-    for number, line in enumerate(file.read_text("utf-8-sig", "replace").splitlines(), start=1):
-        if line.strip() and not line.lstrip().startswith("#"):
-            if (columns := len(line.split())) not in (8, 12, 16):
-                raise DataError(f"{file}:{number}: expected {_POSE_COLUMNS}, got {columns}")
-            return columns
+    for number, line in numbered_lines(file):
+        if (columns := len(line.split())) not in (8, 12, 16):
+            raise DataError(f"{file}:{number}: expected {_POSE_COLUMNS}, got {columns}")
+        return columns
     raise DataError(f"{file}: expected lines of {_POSE_COLUMNS}, got none")
 
 

@@ -26,9 +26,8 @@ from jaxpose.datasets.images import (
 )
 from jaxpose.datasets.types import Accelerometer, Frame, Recording
 from jaxpose.errors import DataError
-from jaxpose.files.tables import read_numbers
-from jaxpose.files.trajectories import nearest
-from jaxpose.files.trajectory_reader import read_trajectory
+from jaxpose.files.tables import numbered_lines, read_numbers, read_stamped_names, seconds
+from jaxpose.files.trajectories import nearest, read_trajectory
 from jaxpose.geometry.camera import Camera
 from jaxpose.imu import GRAVITY_WORLD
 from jaxpose.imu.gravity import gravity_note
@@ -47,8 +46,13 @@ _CAMERAS: dict[str, tuple[Pinhole, tuple[float, ...]]] = {
 class Stamped(NamedTuple):
     """A list of images."""
 
-    t: Float[np.ndarray, " n"]  # seconds since 1970
+    ns: list[int]  # timestamps, increasing, on the file's own clock
     files: list[Path]
+
+    @property
+    def t(self) -> Float[np.ndarray, " n"]:
+        """The timestamps [s]."""
+        return np.array(self.ns, np.float64) / 1e9
 
 
 def detect(path: Path) -> bool:
@@ -78,25 +82,26 @@ def load(path: Path | str, *, max_difference_s: float = 0.02, depth_per_metre: f
         raise DataError(f"{folder}: expected a folder with rgb.txt and depth.txt, got {found(folder)}")
     color, depth = read_list(folder / "rgb.txt"), read_list(folder / "depth.txt")
     rows, partners = _pairs(folder, color.t, depth.t, max_difference_s)
-    timestamps = color.t[rows]
+    ns = [color.ns[row] for row in rows]
+    t, t0_ns = seconds(ns, ns[0]), ns[0]
     colors, depths = [color.files[i] for i in rows], [depth.files[i] for i in partners]
     size = common_size([*colors, *depths])
     pinhole, lens, assumed = _camera(folder, size)
     check_depth(folder, depths, depth_per_metre)
     read_color(colors[0])
-    poses, lacking = _truth(folder / "groundtruth.txt", timestamps, max_difference_s)
+    poses, lacking = _truth(folder / "groundtruth.txt", color.t[rows], max_difference_s)
     notes = [*_alone("colour", "depth", color, rows, max_difference_s)]
     notes += [*_alone("depth", "colour", depth, partners, max_difference_s), *assumed, *lacking]
-    accelerometer, weighed = _accelerometer(folder / "accelerometer.txt", timestamps, poses)
+    accelerometer, weighed = _accelerometer(folder / "accelerometer.txt", t0_ns, t, poses)
     return Recording(
         name=name_of(folder),
         camera=Camera(*pinhole, *size, lens),
-        t=timestamps - timestamps[0],
+        t=t,
         read=lambda i: Frame(read_color(colors[i]), read_depth(depths[i], depth_per_metre)),
         T_world_cam=poses,
         accelerometer=accelerometer,
         notes=(*notes, *weighed),
-        t0=float(timestamps[0]),
+        t0_ns=t0_ns,
         files=within(colors, path),
     )
 
@@ -105,28 +110,8 @@ def read_list(file: Path) -> Stamped:
     """Lines of `timestamp name`, names relative to the list, timestamps increasing."""
     if not file.is_file():
         raise DataError(f"{file}: expected lines of a timestamp and a file name, got {found(file)}")
-    timestamps, files = [], []
-    for number, line in enumerate(file.read_text("utf-8-sig", "replace").splitlines(), start=1):
-        if not line.strip() or line.lstrip().startswith("#"):
-            continue
-        fields = line.split(maxsplit=1)
-        try:
-            timestamp, name = float(fields[0]), fields[1].strip()
-        except (ValueError, IndexError):
-            timestamp, name = np.nan, ""
-        if not np.isfinite(timestamp):
-            raise DataError(
-                f"{file}:{number}: expected a timestamp in seconds and a file name, got {line[:60]!r}"
-            )
-        if timestamps and timestamp <= timestamps[-1]:
-            raise DataError(
-                f"{file}:{number}: expected a timestamp after {timestamps[-1]!r} s, got {timestamp!r} s"
-            )
-        timestamps.append(timestamp)
-        files.append(file.parent / name)
-    if not timestamps:
-        raise DataError(f"{file}: expected lines of a timestamp and a file name, got none")
-    return Stamped(np.array(timestamps), files)
+    ns, names = read_stamped_names(file, unit="s")
+    return Stamped(ns, [file.parent / name for name in names])
 
 
 def _pairs(
@@ -197,18 +182,17 @@ def _truth(
 
 
 def _accelerometer(
-    file: Path, timestamps: Float[np.ndarray, " n"], T_world_cam: Float[np.ndarray, "n 4 4"] | None
+    file: Path, t0_ns: int, t: Float[np.ndarray, " n"], T_world_cam: Float[np.ndarray, "n 4 4"] | None
 ) -> tuple[Accelerometer | None, tuple[str, ...]]:
     """The readings on the frames' clock, in the camera's axes, and a note where ground truth disagrees."""
     if not file.is_file():
         return None, ()
-    if all(line.startswith("#") or not line.strip() for line in file.read_text("utf-8-sig").splitlines()):
+    if not numbered_lines(file):
         return None, ("accelerometer.txt has no readings",)
     _, values = read_numbers(file, "4 numbers (t ax ay az)", (4,))
     values = values[np.argsort(values[:, 0], kind="stable")]
-    t, force_cam = values[:, 0] - timestamps[0], values[:, 1:] @ _R_CAM_KINECT.T
+    read_at, force_cam = values[:, 0] - t0_ns / 1e9, values[:, 1:] @ _R_CAM_KINECT.T
     if T_world_cam is None:
-        return Accelerometer(t, force_cam), ()
-    gravity = np.array(GRAVITY_WORLD)
-    notes = gravity_note(t, force_cam, timestamps - timestamps[0], T_world_cam, gravity, "accelerometer.txt")
-    return Accelerometer(t, force_cam), notes
+        return Accelerometer(read_at, force_cam), ()
+    notes = gravity_note(read_at, force_cam, t, T_world_cam, np.array(GRAVITY_WORLD), "accelerometer.txt")
+    return Accelerometer(read_at, force_cam), notes

@@ -76,14 +76,15 @@ def recorded(folder: Path | str, duration_s: float, rate_hz: float) -> Motion:
     DataError where they have no two frames in common, or the motion goes below the floor.
     """
     folder = Path(folder)
-    imu, ground_truth = euroc.load_imu(folder).imu, euroc.load_truth(folder)
-    first, last = max(imu.t[0], ground_truth.t[0]), min(imu.t[-1], ground_truth.t[-1])
-    t = np.arange(int(np.floor(min(duration_s, last - first) * rate_hz + 1e-9)) + 1) / rate_hz
+    t0_ns, first = euroc.common_start(folder)
+    imu, ground_truth = euroc.load_imu(folder, t0_ns).imu, euroc.load_truth(folder, t0_ns)
+    last = min(imu.t[-1], ground_truth.t[-1])
+    t = np.arange(int(np.floor(min(duration_s, last) * rate_hz + 1e-9)) + 1) / rate_hz
     if len(t) < 2:
         raise DataError(
             f"{folder}: expected two frames at {rate_hz:g} Hz within IMU and ground truth, got {len(t)}"
         )
-    T_world_body = poses_at(Trajectory(ground_truth.t, ground_truth.T_world_body), np.asarray(first + t))
+    T_world_body = poses_at(Trajectory(ground_truth.t, ground_truth.T_world_body), t)
     if np.isnan(T_world_body).any():
         raise DataError(f"{folder}: expected ground truth without gaps above 0.1 s, found one")
     lower, upper = (f(T_world_body[:, :3, 3], axis=0) for f in (np.min, np.max))
@@ -104,7 +105,7 @@ def recorded(folder: Path | str, duration_s: float, rate_hz: float) -> Motion:
         f"rendered room along {name}",
         t,
         T_world_body,
-        Imu(np.asarray(imu.t) - first, imu.omega_body, imu.acceleration_body),
+        imu,
         read_camera_sheet(sheet)[1] if sheet.exists() else own,
         room,
         (what,),

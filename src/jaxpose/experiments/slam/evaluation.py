@@ -126,7 +126,8 @@ def accuracy(
     aligned = trajectory_error.align(ate.alignment, result.T_world_cam)
     rotation_deg = np.degrees(rigid.rotation_angle(aligned[:, :3, :3], T_world_true[:, :3, :3]))
     field = jax.jit(jax.vmap(result.field.pose, (None, 0)))
-    field_poses = np.asarray(field(result.field_params, jnp.asarray(t, jnp.float32)), np.float64)
+    since_first = jnp.asarray(t - t[0], jnp.float32)
+    field_poses = np.asarray(field(result.field_params, since_first), np.float64)
     numbers = {
         "alignment": "se3",
         "ate_rmse_m": ate.rmse,
@@ -174,7 +175,8 @@ def inertial(recording: Recording, result: SlamResult) -> Inertial | None:
         field = jnp.einsum("nji,nj->ni", R_world_body, at.acceleration_world, precision="highest")
         return at.omega_body, remove_gravity(imu, R_world_body, gravity_world), field
 
-    readings = Imu(*(jnp.asarray(x, jnp.float32) for x in (t, read_omega, read_force)))
+    since_first = t - recording.t[0]
+    readings = Imu(*(jnp.asarray(x, jnp.float32) for x in (since_first, read_omega, read_force)))
     omega, read, field = (np.asarray(x, np.float64) for x in derivatives(result.field_params, readings))
     gyro, accelerometer = (read_omega, omega), (read, field)
     rms = [float(np.sqrt(np.mean((a - b) ** 2))) for a, b in (gyro, accelerometer)]

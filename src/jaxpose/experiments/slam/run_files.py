@@ -101,7 +101,7 @@ def _write_trajectory(folder: Path, recording: Recording, result: SlamResult) ->
     trajectories.write_tum(folder / "trajectory.txt", trajectories.Trajectory(t, result.T_world_cam))
     if ground_truth is not None:
         trajectories.write_tum(folder / "reference.txt", trajectories.Trajectory(t, ground_truth))
-    span = (0.0, float(t[-1] - t[0]))
+    span = (float(t[0]), float(t[-1]))
     write_field(folder / "field.npz", span, [bspline_factor(span, result.field_params)])
 
 

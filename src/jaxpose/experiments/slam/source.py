@@ -175,7 +175,7 @@ def _check_gravity(recording: Recording, options: Options) -> None:
 
 
 def _cut(recording: Recording, options: Options) -> Recording:
-    """The frames asked for, thinned, on a clock that starts at the first of them."""
+    """The frames asked for, thinned; the clock stays the recording's."""
     count = len(recording.t)
     if options.start >= count:
         raise DataError(
@@ -197,19 +197,13 @@ def _cut(recording: Recording, options: Options) -> Recording:
             f"{recording.name}: expected at least {FEWEST_FRAMES} frames to track, got {len(recording.t)} "
             f"from frame {options.start} at {options.rate_hz or options.recorded_hz or _RECORDED_HZ:g} Hz"
         )
-    first, imu, ground_truth = recording.t[0], recording.imu, recording.T_world_cam
-    accelerometer = recording.accelerometer
-    notes = recording.notes
+    ground_truth, notes = recording.T_world_cam, recording.notes
     if ground_truth is not None and np.isfinite(ground_truth).all(axis=(1, 2)).sum() < FEWEST_FRAMES:
         ground_truth, notes = (
             None,
             (*notes, "too few true poses among the frames used: there is no ground truth to compare with"),
         )
     return recording._replace(
-        t=recording.t - first,
-        imu=None if imu is None else imu._replace(t=np.asarray(imu.t) - first),
-        accelerometer=None if accelerometer is None else accelerometer._replace(t=accelerometer.t - first),
-        t0=recording.t0 + float(first),
         T_world_cam=ground_truth,
         notes=notes,
     )

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxpose.errors import DataError
-from jaxpose.files import trajectories, trajectory_reader
+from jaxpose.files import trajectories
 
 
 def trajectory(count=12, start=1.6e9):
@@ -27,8 +27,8 @@ def test_every_format_is_found_and_gives_the_poses_back(tmp_path):
         ("tum", "TUM", True), ("kitti", "KITTI", False), ("euroc", "EuRoC", True),
         ("lines", "4x4 list", False), ("blocks", "4x4 list", False),
     ):  # fmt: skip
-        read = trajectory_reader.read_trajectory(tmp_path / name)
-        assert (read.format, read.stamped, read.repeated) == (found, stamped, 0)
+        read = trajectories.read_trajectory(tmp_path / name)
+        assert (read.format, read.has_timestamps, read.repeated) == (found, stamped, 0)
         np.testing.assert_allclose(read.trajectory.T, written.T, atol=1e-14)
         t = written.t if stamped else np.arange(12)
         np.testing.assert_allclose(read.trajectory.t, t, rtol=0, atol=3e-7 if name == "euroc" else 0)
@@ -59,13 +59,13 @@ def test_what_euroc_cannot_hold(tmp_path):
 def test_of_equal_stamps_the_first_is_kept_and_counted(tmp_path):
     lines = ["1 0 0 0 0 0 0 1", "2 5 0 0 0 0 0 1", "2 6 0 0 0 0 0 1", "3 7 0 0 0 0 0 1"]
     (tmp_path / "tum").write_text("\n".join(lines))
-    read = trajectory_reader.read_trajectory(tmp_path / "tum")
+    read = trajectories.read_trajectory(tmp_path / "tum")
     assert read.repeated == 1
     np.testing.assert_array_equal(read.trajectory.t, [1, 2, 3])
     np.testing.assert_array_equal(read.trajectory.T[:, 0, 3], [0, 5, 7])
     (tmp_path / "tum").write_text("\n".join([*lines, "2.5 0 0 0 0 0 0 1"]))
     with pytest.raises(DataError, match="tum:5: expected a timestamp after 3.0 s, got 2.5 s"):
-        trajectory_reader.read_trajectory(tmp_path / "tum")
+        trajectories.read_trajectory(tmp_path / "tum")
 
 
 @pytest.mark.parametrize(
@@ -84,17 +84,17 @@ def test_of_equal_stamps_the_first_is_kept_and_counted(tmp_path):
 def test_what_is_no_trajectory(tmp_path, text, message):
     (tmp_path / "file").write_text(text)
     with pytest.raises(DataError, match=message) as error:
-        trajectory_reader.read_trajectory(tmp_path / "file")
+        trajectories.read_trajectory(tmp_path / "file")
     assert "\n" not in str(error.value)
 
 
 def test_stamps_of_lists_and_tables(tmp_path):
     file = tmp_path / "timestamps"
     file.write_text("# images\n1.5 rgb/1.5.png\n\n2.25 rgb/2.25.png\n")
-    np.testing.assert_array_equal(trajectory_reader.read_stamps(file), [1.5, 2.25])
+    np.testing.assert_array_equal(trajectories.read_timestamps(file), [1.5, 2.25])
     file.write_text("#timestamp [ns],w\n1403715523912140000,-0.1\n1403715523917140000,0.2\n")
     np.testing.assert_allclose(
-        trajectory_reader.read_stamps(file), [1403715523.91214, 1403715523.91714], rtol=0, atol=3e-7
+        trajectories.read_timestamps(file), [1403715523.91214, 1403715523.91714], rtol=0, atol=3e-7
     )
     for text, message in (
         ("1\n\nx\n", "timestamps:3: expected a line that begins with a timestamp, got 'x'"),
@@ -104,4 +104,4 @@ def test_stamps_of_lists_and_tables(tmp_path):
     ):
         file.write_text(text)
         with pytest.raises(DataError, match=message):
-            trajectory_reader.read_stamps(file)
+            trajectories.read_timestamps(file)
