@@ -80,7 +80,8 @@ def bounding_grid(
     if voxel is None:
         voxel = float(np.clip((np.prod(upper - lower) / nodes) ** (1 / 3), 0.01, 0.2))
     cell = voxel * RATIO ** (levels - 1)
-    upper = lower + np.ceil((upper - lower) / cell) * cell  # whole cells, so that growing keeps every node
+    # Whole cells, so that growing keeps every node; nodes are at multiples of the voxel, as those of blocks.
+    lower, upper = np.floor(lower / cell) * cell, np.ceil(upper / cell) * cell
     return GridConfig(_triple(lower), _triple(upper), voxel, levels, 3 * voxel)
 
 

@@ -1,6 +1,7 @@
 """A SLAM run on disk while it goes: its state, to go on from after a kill."""
 
 import zipfile
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -9,19 +10,19 @@ import numpy as np
 from jaxpose.datasets.types import Recording
 from jaxpose.errors import DataError
 from jaxpose.files import checkpoint as checkpoint_file
+from jaxpose.imu import Imu
 from jaxpose.scenes import GridConfig
+from jaxpose.scenes.voxel_blocks import BlockConfig, packed, unpacked
 from jaxpose.slam.config import SlamConfig
 from jaxpose.slam.map.backend import map_backend
 from jaxpose.slam.pipeline import begin
 from jaxpose.slam.types import SlamState, no_frames
 
-_GRID = ("lower", "upper", "voxel", "levels", "truncation")
-
 
 def save(path: Path | str, state: SlamState) -> None:
     """Write the state of a recording's run after one or more frames, whole or not at all."""
     assert state.grid is not None
-    checkpoint_file.save(path, _as_arrays(state, {name: getattr(state.grid, name) for name in _GRID}))
+    checkpoint_file.save(path, _as_arrays(state, asdict(state.grid)))
 
 
 def load(path: Path | str, recording: Recording, config: SlamConfig) -> SlamState:
@@ -29,33 +30,31 @@ def load(path: Path | str, recording: Recording, config: SlamConfig) -> SlamStat
 
     DataError naming the file if it is damaged or of another run.
     """
+    kind = BlockConfig if config.map.method == "fused" else GridConfig
     try:
         with np.load(path, allow_pickle=False) as file:
-            size = {name: file[f"['grid']['{name}']"] for name in _GRID}
-            frames, keyframes = len(file["['state'].frames.t"]), len(file["['state'].thumbnails"])
+            size = {name: file[f"['grid']['{name}']"].tolist() for name in asdict(kind())}
+            count = {name: len(file[f"['state'].{name}"]) for name in ("frames.t", "thumbnails")}
             readings = len(file["['state'].imu.t"]) if "['state'].imu.t" in file else None
+            blocks = len(file["['state'].map.params[0]"])
     except (zipfile.BadZipFile, ValueError, EOFError, KeyError) as error:
         raise DataError(f"{path}: expected a checkpoint, got {' '.join(str(error).split())}") from None
-    grid = GridConfig(
-        tuple(size["lower"].tolist()),
-        tuple(size["upper"].tolist()),
-        float(size["voxel"]),
-        int(size["levels"]),
-        float(size["truncation"]),
-    )
+    size: dict[str, Any] = {k: tuple(x) if isinstance(x, list) else x for k, x in size.items()}
+    grid = kind(**size)
     state = begin(recording, config)._replace(
-        frames=no_frames(np.zeros(frames)), thumbnails=np.zeros((keyframes, 2, 12, 16)), grid=grid
+        frames=no_frames(np.zeros(count["frames.t"])),
+        thumbnails=np.zeros((count["thumbnails"], 2, 12, 16)),
+        imu=None if readings is None else Imu(*(np.zeros((readings, *shape)) for shape in ((), (3,), (3,)))),
+        grid=grid,
     )
-    if readings is not None and recording.imu is not None:
-        state = state._replace(
-            imu=type(recording.imu)(*(np.resize(x, (readings, *np.shape(x)[1:])) for x in recording.imu))
-        )
     state = state._replace(map=map_backend(state).start())
-    state = checkpoint_file.load(path, _as_arrays(state, size))["state"]
-    if frames > len(recording.t) or (state.frames.t != recording.t[:frames]).any():
+    state = checkpoint_file.load(path, _as_arrays(state, asdict(grid), blocks))["state"]
+    if count["frames.t"] > len(recording.t) or (state.frames.t != recording.t[: count["frames.t"]]).any():
         raise DataError(
             f"{path}: expected a run over frames at the times of {recording.name}, got other times"
         )
+    if isinstance(grid, BlockConfig):
+        state = state._replace(map=state.map._replace(params=unpacked(grid, *state.map.params)))
     return state._replace(
         config=config,
         grid=grid,
@@ -65,9 +64,18 @@ def load(path: Path | str, recording: Recording, config: SlamConfig) -> SlamStat
     )
 
 
-def _as_arrays(state: SlamState, size: dict[str, Any]) -> dict[str, Any]:
-    """What a checkpoint holds: the state but for what the recording and the settings give again."""
+def _as_arrays(state: SlamState, size: dict[str, Any], blocks: int | None = None) -> dict[str, Any]:
+    """What a checkpoint holds: the state but for what the recording and the settings give again.
+
+    Of a map of blocks it holds the rows in use; `blocks` makes a place for as many, to read them into.
+    """
+    assert state.map is not None
     numbers = {name: np.asarray(getattr(state, name)) for name in ("max_depth", "duration_s")}
     motion = state.motion._replace(gyro_bias_sigma=np.asarray(state.motion.gyro_bias_sigma))
     state = state._replace(**numbers, motion=motion, camera=None, config=None, grid=None, images=())
+    if state.map is not None and hasattr(state.map.params, "table"):
+        rows = packed(state.map.params)
+        if blocks is not None:
+            rows = tuple(np.zeros((blocks, *x.shape[1:]), x.dtype) for x in rows)
+        state = state._replace(map=state.map._replace(params=rows))
     return {"state": state, "grid": {name: np.asarray(value) for name, value in size.items()}}

@@ -6,7 +6,7 @@
 import time
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,19 +19,19 @@ from jaxpose.fields import Params, PoseField, bspline, control_points_along, fit
 from jaxpose.geometry import rigid
 from jaxpose.geometry.camera import Camera, angle_of_view
 from jaxpose.imu import GRAVITY_WORLD, Gravity, Imu
-from jaxpose.scenes import GridConfig, SceneField
+from jaxpose.scenes import SceneField
+from jaxpose.scenes.voxel_blocks import BlockConfig, Blocks, blocks_of_grid, voxel_blocks
 from jaxpose.slam.config import SlamConfig
 from jaxpose.slam.initial_pose import first_pose, upright_pose
 from jaxpose.slam.keyframes import FrameReader, keyframe_images, thumbnail
 from jaxpose.slam.map.backend import (
     framed_field,
     grow_to_fit,
-    map_backend,
     map_frame,
     scene_params,
     seen_points,
 )
-from jaxpose.slam.map.texture import make_texture, textured
+from jaxpose.slam.map.texture import Texture, make_texture, textured
 from jaxpose.slam.observation import is_blank, to_device
 from jaxpose.slam.tracker import next_pose
 from jaxpose.slam.tracking.intrinsic_frame import is_due, make_refit, window
@@ -57,8 +57,8 @@ class SlamResult(NamedTuple):
     T_world_cam: Float[np.ndarray, "n 4 4"]
     frames: Frames
     scene: SceneField
-    grid: GridConfig
-    scene_params: Any  # (values of the grid's nodes, their texture)
+    map_config: BlockConfig
+    scene_params: tuple[Blocks, Texture]
     field: PoseField  # camera in the world, over seconds since the first frame
     field_params: Params
     field_rmse_m: float
@@ -256,7 +256,7 @@ def _advance(state: SlamState, frame: Frame, t: float, imu: Imu | None, read: Fr
         return state
     away = np.linalg.norm(points - T_world_cam[:3, 3], axis=1)
     state = state._replace(max_depth=max(state.max_depth, 1.2 * float(np.percentile(away, 99))))
-    state = grow_to_fit(points, state)
+    state = grow_to_fit(frame, points, state)
     image = image._replace(exposure=state.exposure)
     state = map_frame(state, image, points, read, generator, map_key)
     if state.frames.keyframe[i]:
@@ -320,21 +320,30 @@ def _finish(state: SlamState, read: FrameReader) -> SlamResult:
     field = bspline((0.0, float(t[-1])), intervals)
     start = control_points_along(t, T_world_cam, intervals)
     fitted = fit(field, t, T_world_cam, params=start, steps=400, learning_rate=1e-3)
-    assert state.grid is not None and state.map is not None
-    scene, (values,) = map_backend(state).scene, scene_params(state.map)
+    config, blocks = _as_blocks(state)
     keyframes = keyframe_images(read, np.flatnonzero(frames.keyframe), T_world_cam)
-    texture = make_texture(state.grid, np.asarray(values[..., 0]), keyframes, state.camera)
+    texture = make_texture(config, blocks, keyframes, state.camera)
     return SlamResult(
         T_world_cam,
         frames,
-        scene=textured(scene, state.grid),
-        grid=state.grid,
-        scene_params=(values, jax.tree.map(jnp.asarray, texture)),
+        scene=textured(voxel_blocks(config), config),
+        map_config=config,
+        scene_params=(blocks, jax.tree.map(jnp.asarray, texture)),
         field=field,
         field_params=fitted.params,
         field_rmse_m=float(fitted.translation_rmse_m),
         field_rmse_deg=float(fitted.rotation_rmse_deg),
     )
+
+
+def _as_blocks(state: SlamState) -> tuple[BlockConfig, Blocks]:
+    """The map as blocks, which is what the method `fused` keeps anyway."""
+    assert state.grid is not None and state.map is not None
+    params = scene_params(state.map)
+    if isinstance(state.grid, BlockConfig):
+        return state.grid, params
+    (values,) = params
+    return blocks_of_grid(state.grid, np.asarray(values))
 
 
 def _joined(state: SlamState, imu: Imu | None) -> Imu | None:

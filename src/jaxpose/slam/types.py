@@ -12,12 +12,14 @@ from jaxpose.fields import Params
 from jaxpose.geometry.camera import Camera
 from jaxpose.imu import Imu
 from jaxpose.scenes import GridConfig
+from jaxpose.scenes.voxel_blocks import BlockConfig
 from jaxpose.slam.config import SlamConfig
 from jaxpose.slam.map.photometric import MapState
 
 # Settings are no leaves of a state: a state is a pytree of arrays and numbers.
 jax.tree_util.register_static(SlamConfig)
 jax.tree_util.register_static(GridConfig)
+jax.tree_util.register_static(BlockConfig)
 
 
 class TrackingStatus(enum.IntEnum):
@@ -132,5 +134,5 @@ class SlamState(NamedTuple):
     max_depth: float  # [m] how deep the map is
     thumbnails: Float[np.ndarray, "k 2 12 16"]  # of the keyframes (`keyframes.thumbnail`)
     images: tuple[Frame, ...]  # of the keyframes, where no recording can give them again
-    grid: GridConfig | None  # None: before the first frame
+    grid: BlockConfig | GridConfig | None  # how finely the map resolves space; None: before the first frame
     map: MapState | None

@@ -10,14 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxpose import scenes
 from jaxpose.cli.view.types import Picture, Poses, Render
 from jaxpose.errors import DataError
 from jaxpose.experiments.event_nerf import pipeline as event_nerf
 from jaxpose.experiments.noisy_nerf import pipeline as noisy_nerf
 from jaxpose.experiments.slam.map_file import read_map
-from jaxpose.experiments.slam.map_rendering import every, viewer
 from jaxpose.geometry.camera import Camera, scale
+from jaxpose.scenes.voxel_blocks import bounds, voxel_blocks
+from jaxpose.slam.map.raycast import every, viewer
 from jaxpose.slam.map.texture import textured
 from jaxpose.training import photometric
 from jaxpose.training.photometric import TrainConfig
@@ -26,11 +26,11 @@ from jaxpose.training.photometric import TrainConfig
 def of_map(file: Path, camera: Camera, poses: Poses) -> Render:
     """The map of a SLAM run from where `poses` is at a time, light grey where it has no surface."""
     saved = read_map(file)
-    look = viewer(textured(scenes.grid(saved.grid), saved.grid), saved.grid, camera)
-    params = (jnp.asarray(saved.values), jax.tree.map(jnp.asarray, saved.texture))
+    look = viewer(textured(voxel_blocks(saved.config), saved.config), saved.config.truncation, camera)
+    params, box = (saved.blocks, jax.tree.map(jnp.asarray, saved.texture)), bounds(saved.config, saved.blocks)
 
     def render(t: float, width: int) -> Picture:
-        return _picture(look(params, poses(np.array([t]))[0], every(camera, width))[0])
+        return _picture(look(params, box, poses(np.array([t]))[0], every(camera, width))[0])
 
     return render
 

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 
 from jaxpose.datasets.types import Recording
-from jaxpose.experiments.slam.map_rendering import Viewer, every, viewer
 from jaxpose.files import atomic
 from jaxpose.plots.preview import preview
 from jaxpose.plots.slam import View
-from jaxpose.scenes import GridConfig, grid
+from jaxpose.scenes.voxel_blocks import BlockConfig, bounds
 from jaxpose.slam import Progress, checkpoint
-from jaxpose.slam.map.backend import scene_params
+from jaxpose.slam.map.backend import map_backend, scene_params
+from jaxpose.slam.map.raycast import every, viewer
 from jaxpose.slam.types import SlamState
 
 SAVE_EVERY_S = 30.0
@@ -30,7 +30,6 @@ def checkpoint_callback(
     """A callback that writes the settings once, and checkpoint and preview every few seconds."""
     saved = time.perf_counter()
     next_preview = 0.0
-    viewers = lru_cache(maxsize=1)(lambda size: viewer(grid(size), size, recording.camera))
 
     def keep(progress: Progress) -> None:
         nonlocal saved, next_preview
@@ -41,22 +40,29 @@ def checkpoint_callback(
             saved = time.perf_counter()
         now, last = time.perf_counter(), progress.index == progress.count - 1
         if now > next_preview or last:
-            _preview(folder / "preview.png", recording, progress.state, viewers)
+            _preview(folder / "preview.png", recording, progress.state)
             cost = time.perf_counter() - now
             next_preview = time.perf_counter() + max(_PREVIEW_EVERY_S, cost / _SHARE)
 
     return keep
 
 
-def _preview(
-    path: Path, recording: Recording, state: SlamState, viewers: Callable[[GridConfig], Viewer]
-) -> None:
+def _preview(path: Path, recording: Recording, state: SlamState) -> None:
+    """The path so far, and the last frame beside the map."""
     frames, i = state.frames, state.frames.count - 1
     assert state.grid is not None and state.map is not None
     T_world_cam = frames.T_world_body[: i + 1] @ recording.T_body_cam
-    frame = recording.read(i)
+    frame, params = recording.read(i), scene_params(state.map)
+    if isinstance(state.grid, BlockConfig):
+        box = bounds(state.grid, params)
+    else:
+        box = np.array([state.grid.lower, state.grid.upper])
     pixels = every(recording.camera, _WIDTH)
     column, row = np.moveaxis(pixels, -1, 0)
-    rgb, depth = viewers(state.grid)(scene_params(state.map), T_world_cam[i], pixels)
+    scene = map_backend(state).scene
+    rgb, depth = _viewer(scene, state.grid.truncation, recording.camera)(params, box, T_world_cam[i], pixels)
     view = View(f"t = {recording.t[i]:.1f} s", frame.rgb, rgb, frame.depth[row, column], depth)
-    preview(path, T_world_cam, frames.lost[: i + 1], view)
+    preview(path, T_world_cam, frames.lost, view)
+
+
+_viewer = lru_cache(maxsize=1)(viewer)

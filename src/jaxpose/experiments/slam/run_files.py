@@ -4,7 +4,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -58,8 +57,7 @@ def write_run(
     measured = Measured(errors, inertial(recording, result), freedom(recording, result))
     _write_trajectory(folder, recording, result)
     on_update(Update("writing the map"))
-    values, texture = jax.tree.map(np.asarray, result.scene_params)
-    write_map(folder / "map.npz", SavedMap(result.grid, values, texture, result.keyframes))
+    write_map(folder / "map.npz", SavedMap(result.map_config, *result.scene_params, result.keyframes))
     images_folder = "." if options.data is None else options.data.resolve()
     write_camera(folder / "camera.json", recording.camera, recording.files, images_folder)
     atomic.write_json(folder / "config.json", options)
@@ -108,11 +106,10 @@ def _write_trajectory(folder: Path, recording: Recording, result: SlamResult) ->
 def _write_surface(folder: Path, recording: Recording, result: SlamResult) -> tuple[str, ...]:
     """The map as a point cloud and, where scikit-image is installed, as a mesh; a note where it is not."""
     keyframes = partial(keyframe_images, recording.read, result.keyframes, result.T_world_cam)
-    points = point_cloud(keyframes(), recording.camera, result.grid.voxel)
+    points = point_cloud(keyframes(), recording.camera, result.map_config.voxel)
     write_ply(folder / "points.ply", points.points, points.rgb)
     try:
-        values, _ = result.scene_params
-        surface = mesh(result.grid, np.asarray(values), keyframes(), recording.camera)
+        surface = mesh(result.map_config, result.scene_params[0], keyframes(), recording.camera)
     except ImportError:
         return ('no mesh.ply: pip install "jaxpose[mesh]" for marching cubes',)
     write_ply(folder / "mesh.ply", surface.points, surface.rgb, surface.faces)

@@ -15,9 +15,10 @@ from jaxpose.geometry import rigid
 from jaxpose.geometry.camera import Camera, pixel_grid, unproject_numpy
 from jaxpose.scenes import GridConfig, SceneField, bounding_grid, grid, grow, merge
 from jaxpose.scenes.types import Params
-from jaxpose.slam.config import IMU_WEIGHTS, MapConfig, SlamConfig, TrackConfig
+from jaxpose.scenes.voxel_blocks import BlockConfig, empty_blocks, voxel_blocks
+from jaxpose.slam.config import IMU_WEIGHTS, ImuWeights, MapConfig, SlamConfig, TrackConfig
 from jaxpose.slam.keyframes import FrameReader, choose, keyframe_images, overlap
-from jaxpose.slam.map.integrate import make_integrate, sample_map
+from jaxpose.slam.map.integrate import MapSample, grown_map, make_integrate, sample_map
 from jaxpose.slam.map.photometric import MapState, make_descend
 from jaxpose.slam.observation import Image, sample_pixels
 from jaxpose.slam.tracking.gradient import make_gradient
@@ -27,6 +28,7 @@ from jaxpose.slam.tracking.relocalise import relocalise
 from jaxpose.slam.types import SlamState
 
 _SEARCHED_WITH = 400  # pixels
+_ALLOCATION_COLUMNS = 160  # of an image, by whose depth blocks are made: closer than a block is wide
 
 
 @runtime_checkable
@@ -77,19 +79,20 @@ def _map_backend(
     track: TrackConfig,
     config: MapConfig,
     framed: FramedField | None,
-    weights,
-    size: GridConfig,
+    weights: ImuWeights,
+    size: BlockConfig | GridConfig,
 ) -> MapBackend:
-    scene = grid(size)
     scale = {"band": size.truncation, "width": size.truncation / 8}
-    fused = config.method == "fused"
-    if fused:
-        init_map, update = make_integrate(size, camera, size.truncation)
+    if isinstance(size, BlockConfig):
+        scene, update = voxel_blocks(size), make_integrate(size, camera)
+        start, sample = lambda: MapState(empty_blocks(size), ()), partial(sample_map, size)
     else:
         config = replace(config, sample=replace(config.sample, **scale))
+        scene = grid(size)
         init_map, update = make_descend(scene, camera, config)
+        start = lambda: init_map(scene.init(jax.random.key(0)))
+        sample = partial(_sample_grid, scene, size)
     track = replace(track, sample=replace(track.sample, **scale))
-    sample = partial(sample_map, scene, size, fused)
     if track.method == "gauss_newton":
         step = make_register(sample, camera, track)
     else:
@@ -102,13 +105,21 @@ def _map_backend(
         pixels = sample_pixels(pixel_key, image, camera, _SEARCHED_WITH, edge=track.edge)
         return relocalise(partial(sample, scene_params, fusion_state), T_world_cam, sigma, pixels, key)
 
-    start = lambda: init_map(scene.init(jax.random.key(0)))
     return MapBackend(scene, start, update, step, search)
 
 
+def _sample_grid(
+    scene: SceneField, size: GridConfig, params: Params, fusion_state: Any, point: Float[Array, "3"]
+) -> MapSample:
+    """A point in a map of the method `gradient`, which knows the distance in a narrow band only."""
+    del fusion_state
+    distance, rgb = scene.query(params, point, jnp.zeros(3, point.dtype))
+    return MapSample(distance, rgb, (jnp.abs(distance) < 0.98 * size.truncation).astype(distance.dtype))
+
+
 def scene_params(state: MapState) -> Params:
-    """The map as it is queried: one level."""
-    return state.params if len(state.params) == 1 else _merge(state.params)
+    """The map as it is queried: blocks, or a grid of one level."""
+    return _merge(state.params) if type(state.params) is tuple and len(state.params) > 1 else state.params
 
 
 _merge = jax.jit(merge)
@@ -125,13 +136,24 @@ def seen_points(
     return rigid.apply(T_world_cam, points)
 
 
-def grow_to_fit(points: Float[np.ndarray, "n 3"], state: SlamState) -> SlamState:
-    """The state with a grid that holds the points; a few stray ones do not make it grow."""
+def grow_to_fit(frame: Frame, points: Float[np.ndarray, "n 3"], state: SlamState) -> SlamState:
+    """The state with a map that holds what its last frame has measured; `points` are some of it.
+
+    A grid does not grow for a few stray points.
+    """
     bounds = np.percentile(points, [1, 99], axis=0)
+    fused = state.config.map.method == "fused"
     if state.grid is None:
-        levels = 1 if state.config.map.method == "fused" else 2
-        state = state._replace(grid=bounding_grid(bounds, voxel=state.config.voxel, levels=levels))
-        return state._replace(map=map_backend(state).start())
+        size = bounding_grid(bounds, voxel=state.config.voxel, levels=1 if fused else 2)
+        state = state._replace(grid=BlockConfig(size.voxel, size.truncation) if fused else size)
+        state = state._replace(map=map_backend(state).start())
+    assert state.map is not None
+    if isinstance(state.grid, BlockConfig):
+        T_world_cam = state.frames.T_world_body[-1] @ state.T_body_cam
+        step = max(state.camera.width // _ALLOCATION_COLUMNS, 1)
+        measured = seen_points(frame, state.camera, T_world_cam, step=step)
+        return state._replace(map=grown_map(state.grid, state.map, measured))
+    assert state.grid is not None
     lower, upper = bounds
     if (lower >= state.grid.lower).all() and (upper <= state.grid.upper).all():
         return state

@@ -11,9 +11,11 @@ from scipy.ndimage import map_coordinates
 
 from jaxpose.geometry import se3
 from jaxpose.geometry.camera import Camera
-from jaxpose.scenes import GridConfig
+from jaxpose.scenes.voxel_blocks import CELLS, BlockConfig, Blocks, packed
 from jaxpose.slam.keyframes import Keyframe
 from jaxpose.slam.observation import back_project, locate, read_pixels
+
+_PENDING = 1_000_000  # points
 
 
 class Surface(NamedTuple):
@@ -35,42 +37,71 @@ def point_cloud(keyframes: Iterable[Keyframe], camera: Camera, voxel: float) -> 
     def measured(image, T_world_cam):
         return back_project(read_pixels(image, camera, row, column), T_world_cam)
 
-    points, colours = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+    kept, pending = (np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3), np.uint8)), []
     for keyframe in keyframes:
         seen = np.asarray(keyframe.image.depth) > 0
         found = measured(keyframe.image, jnp.asarray(keyframe.T_world_cam, jnp.float32))
-        points = np.concatenate([points, np.asarray(found, np.float64)[seen.ravel()]])
-        colours = np.concatenate([colours, np.asarray(keyframe.image.rgb)[seen]])
-        first = np.unique(np.floor(points / voxel).astype(np.int64), axis=0, return_index=True)[1]
-        points, colours = points[np.sort(first)], colours[np.sort(first)]  # so that memory stays bounded
+        points = np.asarray(found, np.float64)[seen.ravel()]
+        pending.append(_first_of_each((_cubes(points, voxel), points, np.asarray(keyframe.image.rgb)[seen])))
+        if sum(len(x[0]) for x in pending) > max(len(kept[0]), _PENDING):  # so that memory stays bounded
+            kept, pending = _joined([kept, *pending]), []
+    _, points, colours = _joined([kept, *pending])
     return Surface(points, colours, np.zeros((0, 3), np.int64))
 
 
-def mesh(
-    grid: GridConfig,
-    values: Float[np.ndarray, "x y z 4"],
-    keyframes: Iterable[Keyframe],
-    camera: Camera,
-) -> Surface:
+def _cubes(points: Float[np.ndarray, "n 3"], side: float) -> Int[np.ndarray, " n"]:
+    """The cube of space that each point is in, as one number: a million of them to either side."""
+    x, y, z = np.floor(points / side).astype(np.int64).T + (1 << 20)
+    return (x << 42) + (y << 21) + z
+
+
+def _first_of_each(items: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:
+    """Of arrays that go with cubes (the first of them), what came first in each cube, in order."""
+    first = np.sort(np.unique(items[0], return_index=True)[1])
+    return tuple(x[first] for x in items)
+
+
+def _joined(parts: list[tuple[np.ndarray, ...]]) -> tuple[np.ndarray, ...]:
+    return _first_of_each(tuple(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+
+
+def mesh(config: BlockConfig, blocks: Blocks, keyframes: Iterable[Keyframe], camera: Camera) -> Surface:
     """The zero of a map's signed distance by marching cubes, culled to what the keyframes have measured.
 
-    `values` are those of the finest level (`scenes.merge`). A point counts as seen where a keyframe has
-    measured a depth within the grid's truncation of it. Needs scikit-image (extra `mesh`); ImportError
-    without.
+    A point counts as seen where a keyframe has measured a depth within the map's truncation of it. Needs
+    scikit-image (extra `mesh`); ImportError without.
     """
     from skimage.measure import marching_cubes
 
+    coords, values = packed(blocks)
+    corners, triangles, colours, count = (
+        [np.zeros((0, 3))],
+        [np.zeros((0, 3), np.int64)],
+        [np.zeros((0, 3))],
+        0,
+    )
     distance = values[..., 0]
-    if not distance.min() < 0 < distance.max():
-        return Surface(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros((0, 3), np.int64))
-    # In skimage's words the triangles' front then faces growing distances: free space.
-    cells, faces, _, _ = marching_cubes(distance, level=0.0, gradient_direction="descent")
-    points = np.asarray(grid.lower) + grid.voxel * cells.astype(np.float64)
-    channels = [map_coordinates(values[..., k], cells.T, order=1, mode="nearest") for k in (1, 2, 3)]
-    rgb = np.round(255 * np.clip(np.stack(channels, axis=-1), 0, 1)).astype(np.uint8)
-    kept = _seen(points, keyframes, camera, grid.truncation)[faces].all(axis=1)
+    crossed = np.any(distance < 0, axis=(1, 2, 3)) & np.any(distance > 0, axis=(1, 2, 3))
+    for block, nodes in zip(coords[crossed], values[crossed], strict=True):
+        # In skimage's words the triangles' front then faces growing distances: free space.
+        cells, faces, _, _ = marching_cubes(nodes[..., 0], level=0.0, gradient_direction="descent")
+        rgb = [map_coordinates(nodes[..., k], cells.T, order=1, mode="nearest") for k in (1, 2, 3)]
+        corners.append(CELLS * block + cells.astype(np.float64))
+        colours.append(np.stack(rgb, axis=-1))
+        triangles.append(faces + count)
+        count += len(cells)
+    cells, rgb, faces = (np.concatenate(x) for x in (corners, colours, triangles))
+    # Blocks share their outer nodes, and so the corners between them.
+    place = _cubes(cells - np.min(cells, axis=0, initial=np.inf), 1 / 64)
+    _, first, which = np.unique(place, return_index=True, return_inverse=True)
+    cells, rgb, faces = cells[first], rgb[first], np.asarray(which)[faces]
+    whole = (faces != np.roll(faces, 1, axis=1)).all(axis=1)  # no two corners have become one
+    points = config.voxel * cells
+    measured = np.asarray(_seen(points, keyframes, camera, config.truncation))
+    kept = whole & measured[faces].all(axis=1)
     used, faces = np.unique(faces[kept], return_inverse=True)
-    return Surface(points[used], rgb[used], faces.reshape(-1, 3).astype(np.int64))
+    colour = np.round(255 * np.clip(rgb[used], 0, 1)).astype(np.uint8)
+    return Surface(points[used], colour, faces.reshape(-1, 3).astype(np.int64))
 
 
 def _seen(

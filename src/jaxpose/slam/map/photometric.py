@@ -1,6 +1,6 @@
 """Mapping as in the paper: the scene is optimised on rays of the current frame and of keyframes beside it.
 
-`fuse.py` is the other way, and the default.
+`integrate.py` is the other way, and the default.
 """
 
 from functools import partial
@@ -21,7 +21,7 @@ from jaxpose.slam.observation import Image, depth_sigma, sample_depths, sample_p
 
 
 class MapState(NamedTuple):
-    """The scene, and what the method remembers: Adam's moments, or the weight of each node."""
+    """The scene, and what else its method remembers: Adam's moments; nothing beside blocks, which hold it."""
 
     params: Params
     fusion_state: Any
