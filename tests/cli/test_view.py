@@ -16,6 +16,7 @@ import pytest
 import trimesh
 import zstandard
 from helpers import refused
+from helpers.blocks import filled
 from PIL import Image
 
 from jaxpose.cli import main as main_command
@@ -31,7 +32,7 @@ from jaxpose.files import atomic, trajectories
 from jaxpose.files.camera_json import write_camera
 from jaxpose.files.ply import write_ply
 from jaxpose.geometry.camera import Camera
-from jaxpose.scenes import GridConfig
+from jaxpose.scenes.voxel_blocks import BlockConfig
 from jaxpose.slam.map.texture import Texture
 
 COUNT, LAST, FIRST, SPEED = 9, 2.0, 5.0, 0.3  # frames, span [s], first timestamp [s], along x [m/s]
@@ -44,6 +45,15 @@ def poses_at(t):
     T = np.tile(np.eye(4), (len(t), 1, 1))
     T[:, 0, 3] = SPEED * np.asarray(t)
     return T
+
+
+def red_and_blue_wall(points):
+    """Distance and colour of a wall, red to the left of x = 0 and blue from 0.1 on."""
+    values = np.zeros((*points.shape[:-1], 4))
+    values[..., 0] = np.clip(WALL - points[..., 2], -0.3, 0.3)
+    left = points[..., 0] < 0.05
+    values[..., 1], values[..., 3] = left, ~left
+    return values
 
 
 @pytest.fixture
@@ -66,14 +76,10 @@ def run(tmp_path):
     for k, name in enumerate(names):
         Image.new("RGB", (320, 240), (k, 0, 0)).save(folder / name)
     write_camera(folder / "camera.json", CAMERA, names, ".")
-    grid = GridConfig((-2.0, -2.0, -0.4), (2.4, 2.0, 2.0), 0.1, 1, 0.3)
-    x, _, z = np.meshgrid(*(np.arange(n) for n in (45, 41, 25)), indexing="ij")
-    values = np.zeros((45, 41, 25, 4), np.float32)
-    values[..., 0] = np.clip(WALL - (grid.lower[2] + 0.1 * z), -0.3, 0.3)
-    left = grid.lower[0] + 0.1 * x < 0.1
-    values[..., 1], values[..., 3] = left, ~left
-    unpainted = Texture(np.zeros((6, 5, 3), np.int32), np.zeros((1, 17, 17, 17, 4), np.uint8))
-    write_map(folder / "map.npz", SavedMap(grid, values, unpainted, np.array([0, 4])))
+    config = BlockConfig(0.1, 0.3)
+    blocks = filled(config, (-2.0, -2.0, -0.4), (2.4, 2.0, 2.0), red_and_blue_wall)
+    untextured = Texture(np.zeros(blocks.coords.shape[0], np.int32), np.zeros((1, 17, 17, 17, 4), np.uint8))
+    write_map(folder / "map.npz", SavedMap(config, blocks, untextured, np.array([0, 4])))
     corners = np.array([[-1, -1, WALL], [1, -1, WALL], [1, 1, WALL]])
     write_ply(folder / "mesh.ply", corners, np.full((3, 3), 200, np.uint8), np.array([[0, 2, 1]]))
     atomic.write_json(folder / "results.json", {"experiment": "rgbd_slam"})

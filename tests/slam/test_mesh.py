@@ -7,17 +7,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
+from helpers.blocks import filled, over_box
 
 from jaxpose.files.ply import read_points, write_ply
 from jaxpose.geometry.camera import Camera
-from jaxpose.scenes import GridConfig, node_positions
+from jaxpose.scenes.voxel_blocks import BlockConfig
 from jaxpose.slam.keyframes import Keyframe
 from jaxpose.slam.map.mesh import mesh, point_cloud
 from jaxpose.slam.observation import Image
 
 RADIUS = 0.5  # m
 CAMERA = Camera(fx=60.0, fy=60.0, cx=39.5, cy=29.5, width=80, height=60)
-GRID = GridConfig((-0.8, -0.8, -0.8), (0.8, 0.8, 0.8), 0.04, 1, 0.12)
+CONFIG, BOX = BlockConfig(0.04, 0.12), ((-0.8, -0.8, -0.8), (0.8, 0.8, 0.8))
 
 
 def looking_at_the_sphere(index, T_world_cam):
@@ -48,16 +49,19 @@ def keyframes():
     return [looking_at_the_sphere(k, T) for k, T in enumerate((along_x, along_y))]
 
 
-@pytest.fixture(scope="module")
-def values():
-    """The sphere's signed distance and colour on the nodes."""
-    nodes = node_positions(GRID).astype(np.float64)
+def sphere(nodes):
+    """The sphere's signed distance and colour."""
     distance = np.clip(np.linalg.norm(nodes, axis=-1) - RADIUS, -0.12, 0.12)
-    return np.concatenate([distance[..., None], 0.5 + nodes], axis=-1).astype(np.float32)
+    return np.concatenate([distance[..., None], 0.5 + nodes], axis=-1)
 
 
-def test_the_mesh_is_the_sphere_where_it_was_seen(values, keyframes):
-    surface = mesh(GRID, values, keyframes, CAMERA)
+@pytest.fixture(scope="module")
+def blocks():
+    return filled(CONFIG, *BOX, sphere)
+
+
+def test_the_mesh_is_the_sphere_where_it_was_seen(blocks, keyframes):
+    surface = mesh(CONFIG, blocks, keyframes, CAMERA)
     radius = np.linalg.norm(surface.points, axis=1)
     assert np.abs(radius - RADIUS).max() < 0.04**2 / RADIUS  # the sagitta of a cell
     towards = -surface.points[:, :2].min(axis=1)
@@ -71,23 +75,22 @@ def test_the_mesh_is_the_sphere_where_it_was_seen(values, keyframes):
     assert surface.faces.max() == len(surface.points) - 1  # nothing but what triangles use
 
 
-def test_a_whole_sphere_is_closed(values, keyframes):
+def test_a_whole_sphere_is_closed(blocks, keyframes):
     turned = [np.diag([1.0, -1, -1, 1]), np.diag([-1.0, 1, -1, 1]), np.diag([-1.0, -1, 1, 1])]
     views = [k._replace(T_world_cam=T @ k.T_world_cam) for k in keyframes for T in turned] + keyframes
     down = np.eye(4)
     down[2, 3] = -2
     views += [looking_at_the_sphere(8, down), looking_at_the_sphere(9, np.diag([1.0, -1, -1, 1]) @ down)]
     views = [looking_at_the_sphere(k.index, k.T_world_cam) for k in views]
-    surface = mesh(GRID, values, views, CAMERA)
+    surface = mesh(CONFIG, blocks, views, CAMERA)
     solid = trimesh.Trimesh(surface.points, surface.faces, process=False)
     assert solid.is_watertight
     assert solid.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.02)
 
 
-def test_nothing_seen_is_an_empty_mesh(values, keyframes):
-    free = np.broadcast_to(np.float32([0.12, 0.5, 0.5, 0.5]), values.shape)
-    assert len(mesh(GRID, free, keyframes, CAMERA).faces) == 0
-    assert len(mesh(GRID, values, [], CAMERA).faces) == 0
+def test_nothing_seen_is_an_empty_mesh(blocks, keyframes):
+    assert len(mesh(CONFIG, over_box(CONFIG, *BOX), keyframes, CAMERA).faces) == 0
+    assert len(mesh(CONFIG, blocks, [], CAMERA).faces) == 0
 
 
 def test_the_cloud_has_one_measured_point_in_each_cube(keyframes):
@@ -99,8 +102,8 @@ def test_the_cloud_has_one_measured_point_in_each_cube(keyframes):
     assert len(point_cloud(keyframes[:1], CAMERA, 0.05).points) < len(points)
 
 
-def test_written_meshes_open_in_another_program(values, keyframes, tmp_path):
-    surface = mesh(GRID, values, keyframes, CAMERA)
+def test_written_meshes_open_in_another_program(blocks, keyframes, tmp_path):
+    surface = mesh(CONFIG, blocks, keyframes, CAMERA)
     write_ply(tmp_path / "mesh.ply", surface.points, surface.rgb, surface.faces)
     opened = trimesh.load(tmp_path / "mesh.ply", process=False)
     np.testing.assert_allclose(opened.vertices, surface.points, atol=1e-6)
@@ -111,8 +114,8 @@ def test_written_meshes_open_in_another_program(values, keyframes, tmp_path):
     np.testing.assert_allclose(read_points(tmp_path / "points.ply"), surface.points, atol=1e-6)
 
 
-def test_without_the_extra_marching_cubes_says_so(values, keyframes, monkeypatch):
+def test_without_the_extra_marching_cubes_says_so(blocks, keyframes, monkeypatch):
     assert importlib.util.find_spec("skimage") is not None
     monkeypatch.setitem(sys.modules, "skimage.measure", None)
     with pytest.raises(ImportError):
-        mesh(GRID, values, keyframes, CAMERA)
+        mesh(CONFIG, blocks, keyframes, CAMERA)

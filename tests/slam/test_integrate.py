@@ -1,4 +1,4 @@
-"""Mapping a wall: fused against closed form and numpy, the gradient's map against the fused one."""
+"""Mapping a wall: integration against closed form and numpy, the gradient's map against it."""
 
 from functools import partial
 
@@ -6,16 +6,22 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+from helpers.blocks import node_positions, over_box
 from helpers.wall import CAMERA, wall
 from numpy.testing import assert_allclose, assert_array_equal
 
-from jaxpose.scenes import GridConfig, grid, merge, node_positions
-from jaxpose.slam.map.integrate import make_integrate, sample_map
-from jaxpose.slam.map.photometric import MapConfig, make_descend
-from jaxpose.slam.observation import Image, SampleConfig
+from jaxpose.scenes import GridConfig, grid, merge
+from jaxpose.scenes import node_positions as grid_positions
+from jaxpose.scenes.voxel_blocks import BlockConfig, empty_blocks
+from jaxpose.slam.config import MapConfig, SampleConfig
+from jaxpose.slam.map.integrate import grown_map, make_integrate, sample_map
+from jaxpose.slam.map.photometric import MapState, make_descend
+from jaxpose.slam.observation import Image
 
 BAND = 0.15
-CONFIG = GridConfig((-0.4, -0.4, 1.2), (0.4, 0.4, 2.4), voxel=0.05, levels=1, truncation=BAND)
+CONFIG = BlockConfig(voxel=0.05, truncation=BAND)
+BLOCKS = over_box(CONFIG, (-0.4, -0.4, 1.2), (0.4, 0.4, 2.4))
+NODES = node_positions(CONFIG, BLOCKS)
 WALL_Z = 1.83  # between nodes
 SHIFTS = np.array([[0.0, 0, 0], [0.2, -0.1, 0.15], [-0.25, 0.1, -0.1], [0.1, 0.2, 0.3]])
 
@@ -32,11 +38,11 @@ def pose(shift):
     return jnp.asarray(T)
 
 
-def seen_by_all(shifts, margin=1):
+def seen_by_all(shifts, margin=1, nodes=NODES):
     """Nodes that project well within every image, at float64."""
     inside = True
     for shift in shifts:
-        x, y, z = np.moveaxis(node_positions(CONFIG).astype(np.float64) - shift, -1, 0)
+        x, y, z = np.moveaxis(nodes - shift, -1, 0)
         u, v = 60 * x / z + 31.5, 60 * y / z + 23.5
         inside &= (u > margin) & (u < 63 - margin) & (v > margin) & (v < 47 - margin)
     return inside
@@ -60,25 +66,24 @@ def cosine(points):
 
 
 def integrate(images, shifts):
-    init, update = make_integrate(CONFIG, CAMERA, BAND)
-    state = init(grid(CONFIG).init(jax.random.key(0)))
+    """The map after the images, and what its nodes hold."""
+    update, state = make_integrate(CONFIG, CAMERA), MapState(jax.tree.map(jnp.copy, BLOCKS), ())
     for image, shift in zip(images, shifts, strict=True):
         state = update(state, image, pose(shift))
-    return state
+    return state, np.asarray(state.params.values[1:])
 
 
 def test_a_wall_seen_from_several_places_is_exact():
-    state = integrate([wall_image(s) for s in SHIFTS], SHIFTS)
-    distance = WALL_Z - node_positions(CONFIG)[..., 2].astype(np.float64)
+    state, values = integrate([wall_image(s) for s in SHIFTS], SHIFTS)
+    distance = WALL_Z - NODES[..., 2]
     valid = seen_by_all(SHIFTS) & (distance > -BAND + 1e-4)
     assert valid.sum() > 1000
-    values = np.asarray(state.params[0])
     assert_allclose(values[valid, 0], np.minimum(distance, BAND)[valid], atol=2e-6)
     surface = valid & (np.abs(distance) < BAND - 1e-4)
-    assert_allclose(values[surface, 1:], 100 / 255, atol=1e-6)
+    assert_allclose(values[surface, 1:4], 100 / 255, atol=1e-6)
     # What lies behind it was not seen.
     assert_allclose(values[distance < -BAND - 1e-4, 0], BAND, rtol=1e-6)
-    assert_array_equal(np.asarray(state.fusion_state)[distance < -BAND - 1e-4, :2], 0)
+    assert_array_equal(values[distance < -BAND - 1e-4, 6:8], 0)
 
 
 def slanted_image(normal, offset):
@@ -89,11 +94,10 @@ def slanted_image(normal, offset):
 def test_a_slanted_wall_has_its_true_distance():
     """Not that along the optical axis: views from different sides agree."""
     normal = np.array([0.6, 0.0, -0.8])
-    state = integrate([slanted_image(normal, 1.44)], SHIFTS[:1])
-    distance = node_positions(CONFIG).astype(np.float64) @ normal + 1.44
+    state, values = integrate([slanted_image(normal, 1.44)], SHIFTS[:1])
+    distance = NODES @ normal + 1.44
     valid = seen_by_all(SHIFTS[:1], margin=3) & (distance > -BAND / 2)
     assert valid.sum() > 1000
-    values = np.asarray(state.params[0])
     assert_allclose(values[valid, 0], np.minimum(distance, BAND)[valid], atol=1e-3)
     assert np.abs(distance[valid]).min() < 0.01
 
@@ -101,36 +105,39 @@ def test_a_slanted_wall_has_its_true_distance():
 def test_a_surface_at_a_grazing_angle_has_two_sides():
     """A floor 0.3 below the camera: the nodes of the cells that hold it are measured above and below."""
     normal, height = np.array([0.0, -1.0, 0.0]), 0.3
-    state = integrate([slanted_image(normal, height)], SHIFTS[:1])
-    values = np.asarray(state.params[0])
-    distance = node_positions(CONFIG).astype(np.float64) @ normal + height
+    state, values = integrate([slanted_image(normal, height)], SHIFTS[:1])
+    distance = NODES @ normal + height
     below = seen_by_all(SHIFTS[:1], margin=3) & (distance < 0) & (distance > -CONFIG.voxel)
     assert below.sum() > 50
     assert_allclose(values[below, 0], distance[below], atol=2e-3)
 
 
-def test_tiles_leave_nothing_out(monkeypatch):
-    """The grid's sides are no multiples of a tile's."""
-    tiled = integrate([wall_image(s) for s in SHIFTS], SHIFTS)
-    monkeypatch.setattr("jaxpose.slam.map.integrate._TILE", 1000)
-    whole = integrate([wall_image(s) for s in SHIFTS], SHIFTS)
-    assert np.asarray(whole.fusion_state).any()
-    jax.tree.map(partial(assert_allclose, atol=1e-6), tiled, whole)
+def test_nodes_between_blocks_are_the_same_in_both():
+    """Each is computed for itself; what a point reads must not depend on the side it is on."""
+    _, values = integrate([wall_image(s) for s in SHIFTS], SHIFTS)
+    place = np.round(NODES.reshape(-1, 3) / CONFIG.voxel).astype(int)
+    _, which, count = np.unique(place, axis=0, return_inverse=True, return_counts=True)
+    assert count.max() == 8
+    flat = values.reshape(-1, values.shape[-1])
+    for channel in flat.T:
+        low, high = np.full(len(count), np.inf), np.full(len(count), -np.inf)
+        np.minimum.at(low, which.ravel(), channel)
+        np.maximum.at(high, which.ravel(), channel)
+        assert_array_equal(low, high)
 
 
 def test_two_observations_are_weighted_as_numpy_does():
     """Inverse variances of the published sigma at the measured depths, times the cosine of incidence."""
     shifts, errors, greys = SHIFTS[[0, 3]], (0.03, -0.02), (50, 200)
     images = [wall_image(s, error=e, grey=g) for s, e, g in zip(shifts, errors, greys, strict=True)]
-    values = np.asarray(integrate(images, shifts).params[0])
+    _, values = integrate(images, shifts)
     depths = [WALL_Z - s[2] + e for s, e in zip(shifts, errors, strict=True)]
     weights = [(0.0012 + 0.0019 * (d - 0.4) ** 2) ** -2 for d in depths]
-    nodes = node_positions(CONFIG).astype(np.float64)
-    distance = WALL_Z - nodes[..., 2]
+    distance = WALL_Z - NODES[..., 2]
     near = seen_by_all(shifts) & (np.abs(distance) < 0.1)
-    near &= np.all([within_a_pixel(nodes - s) for s in shifts], axis=0)
+    near &= np.all([within_a_pixel(NODES - s) for s in shifts], axis=0)
     assert near.sum() > 200
-    weights = np.stack([w * cosine(nodes[near] - s) for w, s in zip(weights, shifts, strict=True)], axis=-1)
+    weights = np.stack([w * cosine(NODES[near] - s) for w, s in zip(weights, shifts, strict=True)], axis=-1)
     mean = lambda x: np.average(np.broadcast_to(x, weights.shape), axis=-1, weights=weights)
     assert_allclose(values[near, 0], distance[near] + mean(errors), atol=3e-6)
     assert_allclose(values[near, 1], mean(greys) / 255, atol=3e-6)
@@ -138,10 +145,8 @@ def test_two_observations_are_weighted_as_numpy_does():
 
 def test_the_wide_distance_reaches_farther_and_knows_where_it_was_measured():
     """Closed form: a wall's distance, 8 voxels to both sides and no farther."""
-    state = integrate([wall_image(s) for s in SHIFTS], SHIFTS)
-    look = jax.jit(
-        jax.vmap(partial(sample_map, grid(CONFIG), CONFIG, True, state.params, state.fusion_state))
-    )
+    state, values = integrate([wall_image(s) for s in SHIFTS], SHIFTS)
+    look = jax.jit(jax.vmap(partial(sample_map, CONFIG, state.params, ())))
     rng = np.random.default_rng(0)
     points = np.stack([*rng.uniform(-0.1, 0.1, (2, 400)), rng.uniform(1.25, 2.35, 400)], axis=1)
     near, distance = look(jnp.asarray(points, jnp.float32)), WALL_Z - points[:, 2]
@@ -156,27 +161,27 @@ def test_the_wide_distance_reaches_farther_and_knows_where_it_was_measured():
 
 
 def test_pixels_without_depth_change_nothing():
-    init, update = make_integrate(CONFIG, CAMERA, BAND)
     blind = wall_image(SHIFTS[0])._replace(depth=jnp.zeros((48, 64)))
-    before = init(grid(CONFIG).init(jax.random.key(0)))
-    after = update(jax.tree.map(jnp.copy, before), blind, pose(SHIFTS[0]))
-    jax.tree.map(assert_array_equal, after, before)
+    state, _ = integrate([blind], SHIFTS[:1])
+    jax.tree.map(assert_array_equal, state.params, BLOCKS)
 
 
 def test_half_an_image_maps_half_the_wall():
     image = wall_image(SHIFTS[0])
     image = image._replace(depth=image.depth.at[:, :32].set(0))
-    state = integrate([image], SHIFTS[:1])
-    x = node_positions(CONFIG)[..., 0]
-    assert not np.any(np.asarray(state.fusion_state)[x < -0.02])
-    assert np.any(np.asarray(state.fusion_state)[x > 0.02])
+    _, values = integrate([image], SHIFTS[:1])
+    assert not np.any(values[NODES[..., 0] < -0.02, 6:])
+    assert np.any(values[NODES[..., 0] > 0.02, 6:])
 
 
-def test_frames_do_not_recompile():
-    init, update = make_integrate(CONFIG, CAMERA, BAND)
-    state = init(grid(CONFIG).init(jax.random.key(0)))
+def test_nothing_is_compiled_anew_while_the_map_grows():
+    update, state = make_integrate(CONFIG, CAMERA), MapState(empty_blocks(CONFIG, capacity=512, side=32), ())
+    counts = []
     for shift in SHIFTS:
-        state = update(state, wall_image(shift), pose(shift))
+        points = np.array([[0.0, 0, WALL_Z]]) + 3 * shift
+        state = update(grown_map(CONFIG, state, points), wall_image(shift), pose(shift))
+        counts.append(int(state.params.count))
+    assert counts[0] == 28 < counts[-1]  # 27 around the point, and the empty one
     assert update._cache_size() == 1
 
 
@@ -200,11 +205,11 @@ def test_the_gradient_finds_the_same_wall_and_compiles_once():
         )
         losses.append(float(loss))
     assert losses[-1] < losses[0]
-    distance = WALL_Z - node_positions(config)[..., 2].astype(np.float64)
-    near = seen_by_all(SHIFTS, margin=8) & (np.abs(distance) < 0.05)
+    nodes = grid_positions(config).astype(np.float64)
+    distance = WALL_Z - nodes[..., 2]
+    near = seen_by_all(SHIFTS, margin=8, nodes=nodes) & (np.abs(distance) < 0.05)
     assert near.sum() > 100
     found = np.asarray(merge(state.params)[0])[near]
-    fused = np.asarray(integrate([wall_image(s) for s in SHIFTS], SHIFTS).params[0])[near]
-    assert np.median(np.abs(found[:, 0] - fused[:, 0])) < 2e-3
-    assert np.abs(found[:, 0] - fused[:, 0]).max() < 1e-2
+    assert np.median(np.abs(found[:, 0] - distance[near])) < 2e-3
+    assert np.abs(found[:, 0] - distance[near]).max() < 1e-2
     assert_allclose(np.median(found[:, 1]), 100 / 255, atol=0.03)
