@@ -94,7 +94,7 @@ def mesh(config: BlockConfig, blocks: Blocks, keyframes: Iterable[Keyframe], cam
     # Blocks share their outer nodes, and so the corners between them.
     place = _cubes(cells - np.min(cells, axis=0, initial=np.inf), 1 / 64)
     _, first, which = np.unique(place, return_index=True, return_inverse=True)
-    cells, rgb, faces = cells[first], rgb[first], np.asarray(which)[faces]
+    cells, rgb, faces = cells[first], rgb[first], np.asarray(which)[faces.astype(np.int64)]
     whole = (faces != np.roll(faces, 1, axis=1)).all(axis=1)  # no two corners have become one
     points = config.voxel * cells
     measured = np.asarray(_seen(points, keyframes, camera, config.truncation))
