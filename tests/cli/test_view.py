@@ -271,7 +271,7 @@ def test_a_map_of_another_kind(run):
     with np.load(run / "map.npz") as file:
         content = dict(file)
     np.savez(run / "map.npz", **(content | {"version": 1}))
-    with pytest.raises(DataError, match="map.npz: expected a map of version 2, got 1"):
+    with pytest.raises(DataError, match="map.npz: expected a map of version 3, got 1"):
         read_scene(run, 0)
     np.savez(run / "map.npz", **(content | {"keyframes": np.array([0, 9])}))
     with pytest.raises(DataError, match="map.npz: expected keyframes below 9, got 9"):
