@@ -17,6 +17,7 @@ import jaxtyping
 import matplotlib
 import numpy as np
 import pytest
+from helpers.quickly import compile_quickly
 from matplotlib.figure import Figure
 from PIL import Image
 from scipy.spatial.transform import Rotation
@@ -33,8 +34,7 @@ def pytest_runtest_setup(item):
 
     These are the numerics that a compiler could break, and what runs longer than it compiles.
     """
-    quickly = item.get_closest_marker("optimised") is None
-    jax.config.update("jax_disable_most_optimizations", quickly)
+    compile_quickly(item.get_closest_marker("optimised") is None)
 
 
 @pytest.fixture(params=["float32", "float64"])
