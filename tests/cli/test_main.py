@@ -114,6 +114,15 @@ def test_every_subcommand_is_there():
         assert callable(importlib.import_module(found.module).main)
 
 
+def test_a_reader_may_go_before_the_end():
+    command = [sys.executable, "-m", "jaxpose", "planar", "--help"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout is not None and process.stderr is not None
+    process.stdout.close()
+    said = [line for line in process.stderr.read().splitlines() if not line.startswith("  loading")]
+    assert process.wait() == 0 and said == []
+
+
 # --- bad input ------------------------------------------------------------------------------------------
 
 
@@ -187,7 +196,7 @@ def files(tmp_path, monkeypatch):
         ("planar --name ../x", "--name: expected the name of one folder"),
         ("slam --resume", "--resume: expected --out DIR or --name NAME"),
         # options that are none
-        ("slam --sed 3", "--seed"),
+        ("slam --sed 3", "Unrecognized options: --sed, 3; Perhaps you meant: --seed$"),
         ("nerf --stepps 3", "--steps"),
         ("events --treshold 3", "--threshold"),
         ("planar --motion 3", "--motions"),

@@ -66,7 +66,7 @@ def execute(command: Command, args: Sequence[str] | None = None) -> Any:
     """
     config = parse(command, args)
     result = guarded(command.name, lambda on_update: command.run(config, on_update))
-    print(json_text(result) if getattr(config, "json", False) else command.report(result), flush=True)
+    _say(json_text(result) if getattr(config, "json", False) else command.report(result))
     return result
 
 
@@ -87,7 +87,7 @@ def parse(command: Command, args: Sequence[str] | None = None) -> Any:
         if asked in args:
             about = command.description or ""
             what = command.prog, command.config, about, command.groups, command.hidden
-            print(help_text(*what, everything=everything))
+            _say(help_text(*what, everything=everything))
             sys.exit(0)
     complaint = io.StringIO()
     try:
@@ -130,6 +130,14 @@ def fail(name: str, message: str) -> NoReturn:
     sys.exit(f"{name}: {' '.join(message.split())}")
 
 
+def _say(text: str) -> None:
+    """Print to a reader that may have gone, as `head` does."""
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        sys.stdout = open(os.devnull, "w")  # what Python flushes at its end
+
+
 def _keep_compiled() -> None:
     """Keep what is compiled in the user's cache folder, so that the next start does not compile it again.
 
@@ -154,4 +162,5 @@ def _one_line(boxed: str) -> str:
     lines = [line for line in lines if line][1:]
     ends = [k for k, line in enumerate(lines) if line.startswith(("For full helptext", "Argument helptext"))]
     message = " ".join(" ".join(lines[: ends[0]] if ends else lines).split())
-    return re.sub(r"^Error parsing \w+: ", "", message)
+    message = re.sub(r"^Error parsing \w+: ", "", message)
+    return re.sub(r" (Perhaps you meant: --[\w.-]+).*", r"; \1", message)
