@@ -71,7 +71,8 @@ def test_a_window_compares_changed_pixels_and_some_of_all_at_the_same_two_instan
 def test_asynchronous_pairs_are_events_of_one_pixel_at_their_own_times(events):
     config = EventTrainConfig(events=1000, negatives=0.25, longest_s=0.5, back=3)
     streams = index_by_pixel(events, HEIGHT, WIDTH)
-    pairs = jax.device_get(asynchronous_pairs(jax.random.key(0), on_device(streams), SPAN, config))
+    draw = jax.jit(partial(asynchronous_pairs, span=SPAN, config=config))
+    pairs = jax.device_get(draw(jax.random.key(0), on_device(streams)))
     assert_array_equal(pairs.change, counted(events, pairs.pixel, pairs.t_before, pairs.t_now))
     positive = jax.tree.map(lambda x: x[:750], pairs)
     timestamps = {(int(p), float(np.float32(t))) for p, t in zip(streams.pixel, streams.t, strict=True)}

@@ -1,6 +1,6 @@
 """Joint training: renders against plain numpy, the loss, rates by group, poses found again."""
 
-from functools import partial
+from functools import cache, partial
 
 import chex
 import jax
@@ -33,6 +33,7 @@ def ball_scene(centre=(0.0, 0.0, 0.0)):
     return scenes.SceneField(lambda key: {"centre": jnp.asarray(centre, jnp.zeros(()).dtype)}, soft_ball)
 
 
+@jax.jit
 def around(t):
     """Camera-to-world poses on an arc, 3 from the origin, looking at it."""
     turn = se3.exp(jnp.stack([0 * t, 0 * t, 0 * t, 0.2 * t, 0.6 * t, 0.1 * t], axis=-1))
@@ -44,6 +45,7 @@ def photographs(T_world_cam, samples=64):
     return np.stack([np.asarray(look({"centre": jnp.zeros(3)}, pose)[0]) for pose in T_world_cam])
 
 
+@cache
 def views():
     return Views(T, jnp.asarray(np.round(255 * photographs(around(T))), jnp.uint8))
 
@@ -174,7 +176,7 @@ def test_refinement_on_either_side():
     field = fields.table(T)
     params = jnp.asarray(np.random.default_rng(0).normal(size=(5, 6)), jnp.float32)
     initial = fields.piecewise_geodesic(T, around(T))
-    moves, starts = (jax.vmap(partial(f))(T) for f in (partial(field.pose, params), initial))
+    moves, starts = (np.asarray(jax.jit(jax.vmap(f))(T)) for f in (partial(field.pose, params), initial))
     for side, expected in (("body", starts @ moves), ("world", moves @ starts)):
         refined = fields.refine(field, initial, side=side)
-        assert_allclose(jax.vmap(partial(refined.pose, params))(T), expected, atol=1e-5)
+        assert_allclose(jax.jit(jax.vmap(partial(refined.pose, params)))(T), expected, atol=1e-5)
