@@ -48,7 +48,7 @@ class SampleConfig:
     width: float = 0.015  # [m] thickness of a rendered surface (`render.sdf_weights`)
 
     def __post_init__(self):
-        _check(self, "sample", at_least={"front": 1, "surface": 2, "behind": 0}, positive=("band", "width"))
+        _check(self, "sample", at_least={"front": 0, "surface": 2, "behind": 0}, positive=("band", "width"))
 
 
 @dataclass(frozen=True)
