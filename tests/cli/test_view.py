@@ -258,7 +258,7 @@ def test_wrong_calls_cost_one_line(run, tmp_path):
     assert "expected a run folder with trajectory.txt" in complaint(tmp_path / "empty")
     assert "runs in it: run" in complaint(tmp_path)
     assert "got nothing" in complaint(tmp_path / "none")
-    assert "--save: expected a name that ends in .html" in complaint(run, "--save", "x.viser")
+    assert "--save: expected a name that ends in .html or .gif" in complaint(run, "--save", "x.viser")
     assert "--port: expected" in complaint(run, "--port", "65536")
     assert "--frustums: expected" in complaint(run, "--frustums", "-1")
     (run / "mesh.ply").write_text("no mesh")

@@ -2,7 +2,8 @@
 
 RUN is a run folder, or a trajectory file. A slider moves a camera along the run's continuous trajectory and
 shows what the run's map or radiance field shows from there. Nothing is loaded from the network. --save writes
-the scene as one HTML file, the camera on its way in it, which opens in any browser without this program.
+the scene as one HTML file, the camera on its way in it, which opens in any browser without this program, or
+as a GIF of what the camera sees on its way.
 """
 
 import sys
@@ -14,6 +15,7 @@ from typing import Annotated, NamedTuple
 
 import tyro
 
+from jaxpose.cli.view.animation import animate
 from jaxpose.cli.view.scene import read_scene
 from jaxpose.errors import DataError
 from jaxpose.experiments.checks import check_apart, check_least
@@ -31,15 +33,15 @@ class Config:
         "127.0.0.1"  # address to listen at: only this machine sees it; 0.0.0.0: any machine that reaches it
     )
     frustums: int = 30  # so many frames, evenly over the run, are shown as cameras with their pictures
-    save: Path | None = None  # HTML file to write instead
+    save: Path | None = None  # HTML or GIF file to write instead
 
     def __post_init__(self):
         if not 0 <= self.port < 65536:
             raise ValueError(f"--port: expected 0 (any) to 65535, got {self.port}")
         check_least(self, frustums=0)
         check_apart("--save", self.save, self.run)
-        if self.save is not None and self.save.suffix != ".html":
-            raise ValueError(f"--save: expected a name that ends in .html, got {self.save}")
+        if self.save is not None and self.save.suffix not in (".html", ".gif"):
+            raise ValueError(f"--save: expected a name that ends in .html or .gif, got {self.save}")
 
 
 class Shown(NamedTuple):
@@ -66,6 +68,10 @@ def run(config: Config, on_update: OnUpdate = silent) -> Shown:
         DataError, OSError: for what cannot be used.
     """
     on_update(Update(f"reading {config.run}", quiet=True))
+    if config.save is not None and config.save.suffix == ".gif":
+        scene = read_scene(config.run, 0, on_update)
+        animate(scene, config.save, on_update)
+        return Shown(scene.name, None, config.save, scene.notes, lambda: None)
     try:
         from jaxpose.cli.view import page as view_page
     except ImportError:
@@ -96,7 +102,8 @@ def report(shown: Shown) -> str:
     if shown.file is None:
         line = f"{shown.url}  {shown.run}; Ctrl-C ends"
     else:
-        line = f"{shown.file}  {shown.run}; {shown.file.stat().st_size / 1e6:.1f} MB, opens in any browser"
+        line = f"{shown.file}  {shown.run}; {shown.file.stat().st_size / 1e6:.1f} MB"
+        line += ", opens in any browser" if shown.file.suffix == ".html" else ""
     return "\n".join([line, *(f"  note  {note}" for note in shown.notes)])
 
 
