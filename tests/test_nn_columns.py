@@ -1,12 +1,14 @@
 """Layers for many points against numpy, under every vmap and in both directions of differentiation."""
 
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from jaxpose import nn
+from jaxpose import nn, nn_columns
 from jaxpose.nn_columns import dense, frequency_encoding, product, spread
 
 pytestmark = pytest.mark.optimised
@@ -15,6 +17,23 @@ TOLERANCE = {jnp.float32: 3e-5, jnp.float64: 1e-12}
 # Axes of the vmaps, inner ones first, with the shape of what each mapped argument gains.
 RNG = np.random.default_rng(0)
 LAYER = {"kernel": RNG.normal(size=(5, 3)), "bias": RNG.normal(size=3)}
+
+
+@pytest.fixture(autouse=True, params=["primitives", "plain"])
+def rules(request, monkeypatch):
+    """Every test twice: with rules of our own, which this JAX takes, and as on one that does not."""
+    assert nn_columns._product is not None and nn_columns._spread is not None
+    if request.param == "plain":
+        monkeypatch.setattr(nn_columns, "_product", None)
+        monkeypatch.setattr(nn_columns, "_spread", None)
+
+
+@pytest.mark.parametrize("gone", ["jax.core", "jax.extend.core", "jax.interpreters.batching"])
+def test_a_jax_without_a_place_for_rules(gone, monkeypatch):
+    monkeypatch.setitem(sys.modules, gone, None)
+    if gone == "jax.interpreters.batching":
+        monkeypatch.delattr(jax.interpreters, "batching")
+    assert nn_columns._primitives() == (None, None)
 
 
 def layer_as(dtype):
