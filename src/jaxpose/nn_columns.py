@@ -10,7 +10,7 @@ NeRF trains 1.2 to 1.5 times as fast. At one point nothing is to be seen of it: 
 import math
 from collections.abc import Mapping
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -153,7 +153,7 @@ def _axis_second(x, axis, size):
     return jnp.broadcast_to(jnp.expand_dims(x, 1), (x.shape[0], size, *x.shape[1:]))
 
 
-def _primitives():
+def _primitives() -> Any:
     """Product and spread with their rules, or none where this JAX has no place for them.
 
     JAX keeps these places outside of what it promises not to change. Its public ones do not serve:
