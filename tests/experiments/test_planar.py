@@ -232,7 +232,8 @@ def test_small_motions_are_found(pose):
     assert found.corner_px[0] > 5
     assert found.corner_px[-1] < 0.5
     errors = planar_task.corner_errors(photo, found.H_image_patch, task.H_image_patch)
-    assert found.corner_px[-1] == pytest.approx(errors[1:].mean()) and errors[0] == 0
+    assert found.corner_px[-1] == pytest.approx(errors[1:].mean())
+    assert errors[0] < 1e-4, "the first patch stays, but for rounding"
     assert len(found.loss) == 12 and found.loss[-1] < 0.05 * found.loss[0]
     assert found.psnr > 25
     seen = planar_task.covered(photo, task.H_image_patch)
