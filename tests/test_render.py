@@ -272,38 +272,60 @@ WEIGHTS = {
 }
 
 
-@pytest.mark.parametrize("weights", WEIGHTS.values(), ids=WEIGHTS.keys())
-def test_gradients_are_finite_where_compiled(weights):
-    """Rays that start outside, inside and beyond a corner of a room, and end in a wall or nowhere.
+def corner(point):
+    """Signed distance to three walls, as one would write it."""
+    return jnp.min(jnp.asarray([0.6, 0.4, 2.0], point.dtype) - point)
 
-    The compiled gradient is that of the same rays in float64, op by op. A scene's `jnp.min` is what the
-    compiler of JAX 0.12 once made NaN of.
-    """
-    walls = np.array([0.6, 0.4, 2.0])
 
-    def corner(point, direction):
-        del direction
-        return jnp.min(jnp.asarray(walls, point.dtype) - point), 0.5 + 0.3 * jnp.sin(4 * point)
+def occupied(distance):
+    return jax.nn.sigmoid(-distance / WIDTH)
 
-    def loss(T_world_cam, direction_cam):
-        direction = jnp.einsum("ij,j->i", T_world_cam[:3, :3], direction_cam, precision="highest")
-        depths = jnp.linspace(0.5, 3.5, 41, dtype=direction.dtype)
-        seen = render_ray(corner, Ray(T_world_cam[:3, 3], direction), depths, weights=weights)
-        return jnp.sum(seen.rgb**2) + seen.depth + seen.opacity
 
-    T = np.tile(np.eye(4), (4, 1, 1))
-    T[:, :3, 3] = [[0, 0, 0], [1e-6, 1e-6, 1e-6], [0, 0.1, 1.8], [2, 2, 5]]
+def opaque(distance):
+    """Occupancies of exactly 0 and 1 on both sides of a slope."""
+    return jnp.where(distance > 0.1, 0, jnp.where(distance < -0.1, 1, 0.5 - 5 * distance))
+
+
+@pytest.mark.parametrize(
+    ("weights", "geometry"),
+    [
+        (surface_weights(WIDTH), lambda distance: distance),
+        (occupancy_weights, occupied),
+        (occupancy_weights, opaque),
+        (density_weights, lambda distance: 80 * occupied(distance)),
+    ],
+    ids=["sdf", "occupancy", "opaque", "density"],
+)
+def test_compiled_gradients_of_rays_that_end_and_that_do_not(weights, geometry):
+    """By the pose: float32 and float64, and float64 and finite differences, each ray by itself."""
     x, y = np.meshgrid(np.linspace(-0.6, 0.6, 10), np.linspace(-0.5, 0.5, 8))
-    directions = np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1)
-    gradients = jax.vmap(jax.vmap(jax.grad(loss), (None, 0)), (0, None))
-    found = jax.jit(gradients)(jnp.asarray(T, jnp.float32), jnp.asarray(directions, jnp.float32))
-    assert np.isfinite(found).all()
+    ahead = np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1)
+    # At the walls, along and away from them, and at them from inside of one.
+    directions = np.concatenate([ahead, ahead * [1, 1, -1], ahead])
+    starts = np.repeat([[0, 0, 0], [0, 0, 0], [0, 0.5, 0]], len(ahead), axis=0) + [0.03, 0.02, 0.01]
+
+    def seen(xi, start, direction):
+        scene = lambda point, direction: (geometry(corner(point)), 0.5 + 0.3 * jnp.sin(4 * point))
+        T = se3.exp(xi)
+        ray = Ray(start + T[:3, 3], jnp.einsum("ij,j->i", T[:3, :3], direction, precision="highest"))
+        depths = jnp.linspace(0.503, 3.51, 41, dtype=xi.dtype)
+        result = render_ray(scene, ray, depths, weights=weights)
+        return jnp.sum(result.rgb) + result.depth + result.variance + result.opacity
+
+    def gradients(dtype):
+        xi, *rays = (jnp.asarray(a, dtype) for a in (np.zeros(6), starts, directions))
+        return np.asarray(jax.jit(jax.vmap(jax.grad(seen), in_axes=(None, 0, 0)))(xi, *rays))
+
+    single = gradients(jnp.float32)
     with jax.enable_x64(True):
-        expected = np.asarray(gradients(jnp.asarray(T), jnp.asarray(directions)))
-    scale = np.abs(expected).max()
-    assert (
-        np.median(np.abs(found - expected)) < 1e-5 * scale and np.abs(found - expected).mean() < 1e-3 * scale
-    )
+        double = gradients(jnp.float64)
+        image = jax.vmap(jax.vmap(seen, in_axes=(None, 0, 0)), in_axes=(0, None, None))
+        steps = 1e-7 * np.concatenate([np.eye(6), -np.eye(6)])
+        found = jax.jit(image)(*map(jnp.asarray, (steps, starts, directions)))
+    forth, back = np.split(np.asarray(found), 2)
+    size = np.abs(double).max(axis=1, keepdims=True)
+    assert np.all(np.abs(double - (forth - back).T / 2e-7) < 1e-5 * size + 1e-7)
+    assert np.all(np.abs(single - double) < 2e-4 * size + 1e-7)
 
 
 @pytest.mark.parametrize(

@@ -184,10 +184,14 @@ def sdf_weights(
     _check_samples(distance=distance, depth=depth)
     if width <= 0:
         raise ValueError(f"width: expected more than 0 m, got {width}")
-    edges = jnp.concatenate([distance[:1], (distance[1:] + distance[:-1]) / 2, distance[-1:]])
-    outside = jax.nn.sigmoid(edges / width)
+    edges = jnp.concatenate([distance[:1], (distance[1:] + distance[:-1]) / 2, distance[-1:]]) / width
+    before, after = edges[:-1], edges[1:]
+    # The share of `outside` that is lost, 1 - sigmoid(after) / sigmoid(before), as a product: a difference
+    # would be rounding where both are near 1. Not `jnp.clip`, whose gradient compares for equality.
+    closer = jnp.where(after > before, 0, after - before)
     # A start inside a surface (outside = 0) must not divide by zero.
-    ends = jnp.clip((outside[:-1] - outside[1:]) / (outside[:-1] + 1e-4), 0, 1)
+    outside = jax.nn.sigmoid(before)
+    ends = -jnp.expm1(closer) * jax.nn.sigmoid(-after) * outside / (outside + 1e-4)
     return ends * _transmittance(ends)
 
 
@@ -279,8 +283,8 @@ def _before(x: Float[Array, " s"]) -> Float[Array, " s"]:
 
 
 def _transmittance(ends: Float[Array, " s"]) -> Float[Array, " s"]:
-    """Probability of reaching each sample, given that of ending at each; 1e-10 as in NICE-SLAM."""
-    passed = jnp.cumprod(1 - ends + 1e-10)
+    """Probability of reaching each sample, given that of ending at each."""
+    passed = jnp.cumprod(1 - ends)
     return jnp.concatenate([jnp.ones_like(passed[:1]), passed[:-1]])
 
 
