@@ -60,7 +60,7 @@ def data(count: int) -> EventData:
 def trainer(loss: event_training.Loss, config: Config, chunk: int) -> Trainer:
     field = fields.posenet(fields.PoseNetConfig(span=SPAN))
     start = jnp.eye(4).at[2, 3].set(-4.0)
-    field = fields.refine(field, lambda t: start)
+    field = fields.right_correction(field, fields.constant(start))
     train = EventTrainConfig(events=config.events, samples=config.samples, chunk=chunk, loss=loss)
     return event_training.trainer(
         scenes.nerf(), field, CAMERA, Depths(2.0, 6.0), SPAN, Rate(5e-4, 5e-4), RATES, train

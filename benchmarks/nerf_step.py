@@ -40,12 +40,12 @@ class Config:
 def trainer(pose: str, config: TrainConfig) -> Trainer:
     t = np.arange(float(IMAGES))
     if pose == "table":
-        field, rates = fields.table(t), Rate(1e-3, 1e-5)
+        field, rates = fields.per_frame_poses(t), Rate(1e-3, 1e-5)
     else:
         field = fields.posenet(fields.PoseNetConfig(span=(0.0, t[-1])))
         rates = {"translation": Rate(1e-3, 1e-5), "rotation": Rate(2e-4, 1e-6)}
     start = jnp.eye(4).at[2, 3].set(-4.0)
-    field = fields.refine(field, lambda t: start)
+    field = fields.right_correction(field, fields.constant(start))
     return photometric.trainer(scenes.nerf(), field, CAMERA, DEPTHS, Rate(5e-4, 1e-4), rates, config)
 
 

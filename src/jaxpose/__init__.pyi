@@ -6,6 +6,7 @@ from . import files as files
 from . import geometry as geometry
 from . import imu as imu
 from . import losses as losses
+from . import optim as optim
 from . import plots as plots
 from . import render as render
 from . import scenes as scenes
@@ -22,9 +23,9 @@ from .fields import PoseNetConfig as PoseNetConfig
 from .fields import bspline as bspline
 from .fields import fit as fit
 from .fields import motion as motion
+from .fields import per_frame_poses as per_frame_poses
 from .fields import piecewise_geodesic as piecewise_geodesic
 from .fields import posenet as posenet
-from .fields import table as table
 from .geometry import Camera as Camera
 from .geometry import project as project
 from .geometry import se3 as se3

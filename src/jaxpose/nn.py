@@ -17,10 +17,20 @@ Precision = Literal["default", "high", "highest"]
 def frequency_encoding(
     x: Float[Array, "*n d"], octaves: int, *, weights: Float[Array, " octaves"] | None = None
 ) -> Float[Array, "*n encoded"]:
-    """`[x, sin(2^k pi x), cos(2^k pi x)]` for k = 0 .. octaves - 1, bands together per coordinate of `x`.
+    """`[x, sin(2^k pi x), cos(2^k pi x)]` for k = 0 .. octaves - 1.
 
-    The length is `d (1 + 2 octaves)`; octaves = 0 returns `x`. `weights` (see `window_weights`) multiply the
-    bands and never `x` itself. METHOD section 2, PEERS B1.
+    Bands of one coordinate are together (Mildenhall et al. 2020, eq. 4, with `x` itself in front).
+
+    Args:
+        x: (..., d).
+        octaves: number of bands; 0 returns `x`.
+        weights: (octaves,), what multiplies the bands and never `x` itself: see `window_weights`.
+
+    Returns:
+        Features (..., d (1 + 2 octaves)).
+
+    >>> print(frequency_encoding(jnp.array([0.5]), 1).round(6) + 0.0)
+    [0.5 1.  0. ]
     """
     if octaves == 0:
         return x
@@ -37,9 +47,21 @@ def frequency_encoding(
 def window_weights(
     progress: Float[Array, ""], octaves: int, window: tuple[float, float]
 ) -> Float[Array, " octaves"]:
-    """Coarse-to-fine weight of every octave at `progress` in [0, 1]: bands open one by one within `window`.
+    """Coarse-to-fine weight of every octave: bands open one by one within a window of the training.
 
-    w_k = (1 - cos(pi clamp(alpha - k, 0, 1))) / 2 with alpha = octaves (progress - a) / (b - a), as in BARF.
+    w_k = (1 - cos(pi clamp(alpha - k, 0, 1))) / 2, alpha = octaves (progress - a) / (b - a) (BARF, Lin et al.
+    2021, eq. 14).
+
+    Args:
+        progress: share of the training, 0 to 1.
+        octaves: number of bands.
+        window: (a, b), where the first begins to open and where the last is open.
+
+    Returns:
+        Weights (octaves,) from 0 to 1.
+
+    >>> print(window_weights(jnp.array(0.5), 4, (0.0, 1.0)))
+    [1. 1. 0. 0.]
     """
     start, end = window
     alpha = octaves * (progress - start) / (end - start)
@@ -82,12 +104,26 @@ def mlp(
     small_output: bool = False,
     precision: Precision = "default",
 ) -> Network:
-    """A perceptron of `layers` linear layers (the output counted), Xavier-uniform times `gain`, zero bias.
+    """A perceptron, Xavier-uniform with zero bias.
 
-    The input is concatenated again at the input of layer number `skip` (from 0; nothing where there is no
-    such layer). `small_output` draws the last layer from U(0, 1e-7), so that the output starts at zero.
-    `precision` is that of the products: "highest" for what is differentiated in time. Parameters have the
-    default float type at the time of `init`.
+    Args:
+        inputs: length of what it takes, and
+        outputs: of what it gives.
+        layers: linear layers, the output counted.
+        width: of the hidden layers.
+        skip: the layer (from 0) at whose input the network's input is concatenated again; nothing where there
+            is no such layer.
+        activation: between layers.
+        gain: what Xavier's draw is multiplied by.
+        small_output: draws the last layer from U(0, 1e-7), so that the output starts at zero.
+        precision: of the products: "highest" for what is differentiated in time.
+
+    Returns:
+        The network; its parameters have the default floating-point type at the time of `init`.
+
+    >>> network = mlp(2, 3, layers=2, width=8)
+    >>> network.apply(network.init(jax.random.key(0)), jnp.zeros((5, 2))).shape
+    (5, 3)
     """
     module = _MLP(outputs, layers, width, skip, activation, gain, small_output, precision)
 

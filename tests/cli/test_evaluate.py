@@ -15,12 +15,13 @@ from helpers import refused
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from jaxpose import fields
 from jaxpose.cli import evaluate
 from jaxpose.cli import main as main_command
 from jaxpose.cli.evaluate import Config
 from jaxpose.errors import DataError
 from jaxpose.evaluation import trajectory_error
-from jaxpose.fields import numpy_evaluator, serialization
+from jaxpose.fields import numpy_evaluator
 from jaxpose.files import atomic, trajectories
 from jaxpose.geometry import rigid
 
@@ -163,9 +164,7 @@ def run_folder(tmp_path):
     span = (0.0, 3.0)
     rng = np.random.default_rng(0)
     points = np.cumsum(0.1 * rng.normal(size=(33, 7)), axis=0)
-    serialization.write_field(
-        folder / "field.npz", span, [serialization.bspline_factor(span, jnp.asarray(points))]
-    )
+    fields.save(folder / "field.npz", fields.bspline(span, len(points) - 3), jnp.asarray(points))
     t = np.linspace(0, 3, 31)
     trajectories.write_tum(
         folder / "trajectory.txt", trajectories.Trajectory(t, numpy_evaluator.load(folder / "field.npz")(t))

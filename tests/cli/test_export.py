@@ -9,12 +9,13 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from jaxpose import fields
 from jaxpose.cli import export
 from jaxpose.cli import main as main_command
 from jaxpose.cli.export import Config
 from jaxpose.datasets.photos import blender
 from jaxpose.errors import DataError
-from jaxpose.fields import numpy_evaluator, serialization
+from jaxpose.fields import numpy_evaluator
 from jaxpose.files import atomic, trajectories
 from jaxpose.files.camera_json import read_camera, write_camera
 from jaxpose.geometry.camera import Camera
@@ -40,9 +41,7 @@ def run(tmp_path, recording):
     folder.mkdir()
     rng = np.random.default_rng(0)
     points = np.cumsum(0.2 * rng.normal(size=(23, 7)), axis=0)
-    serialization.write_field(
-        folder / "field.npz", SPAN, [serialization.bspline_factor(SPAN, jnp.asarray(points))]
-    )
+    fields.save(folder / "field.npz", fields.bspline(SPAN, len(points) - 3), jnp.asarray(points))
     t = np.linspace(*SPAN, COUNT)
     poses = numpy_evaluator.load(folder / "field.npz")(t)
     poses[:, :3, :3] = poses[:, :3, :3] @ Rotation.from_rotvec(0.01 * rng.normal(size=(COUNT, 3))).as_matrix()

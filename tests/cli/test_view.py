@@ -19,6 +19,7 @@ from helpers import refused
 from helpers.blocks import filled
 from PIL import Image
 
+from jaxpose import fields
 from jaxpose.cli import main as main_command
 from jaxpose.cli.view import command as view
 from jaxpose.cli.view import page as view_page
@@ -27,7 +28,6 @@ from jaxpose.cli.view.scene import read_scene, up_direction
 from jaxpose.cli.view.types import WIDTH
 from jaxpose.errors import DataError
 from jaxpose.experiments.slam.map_file import SavedMap, write_map
-from jaxpose.fields import serialization
 from jaxpose.files import atomic, trajectories
 from jaxpose.files.camera_json import write_camera
 from jaxpose.files.ply import write_ply
@@ -64,9 +64,7 @@ def run(tmp_path):
     span, intervals = (FIRST, FIRST + LAST), 4
     points = np.zeros((intervals + 3, 7))
     points[:, 0] = SPEED * (np.arange(intervals + 3) - 1) * LAST / intervals
-    serialization.write_field(
-        folder / "field.npz", span, [serialization.bspline_factor(span, jnp.asarray(points))]
-    )
+    fields.save(folder / "field.npz", fields.bspline(span, len(points) - 3), jnp.asarray(points))
     t = np.linspace(0, LAST, COUNT)
     trajectories.write_tum(folder / "trajectory.txt", trajectories.Trajectory(FIRST + t, poses_at(t)))
     ground_truth = poses_at(t)

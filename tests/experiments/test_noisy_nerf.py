@@ -15,6 +15,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.interpolate import splrep
 from scipy.spatial.transform import Rotation
 
+from jaxpose import fields
 from jaxpose.datasets.photos import blender
 from jaxpose.evaluation import trajectory_error
 from jaxpose.experiments import training_loop
@@ -24,7 +25,6 @@ from jaxpose.experiments.noisy_nerf.options import _STUDIES, Config, load, studi
 from jaxpose.experiments.noisy_nerf.report import report, table
 from jaxpose.experiments.training_loop import NetConfig
 from jaxpose.fields import numpy_evaluator
-from jaxpose.fields.serialization import write_field
 from jaxpose.files import atomic, trajectories
 from jaxpose.files.camera_json import read_camera
 from jaxpose.geometry import rigid
@@ -109,8 +109,8 @@ def test_every_field_is_a_file_for_numpy(tmp_path, changes):
     rng = np.random.default_rng(0)
     leaves = [leaf + jnp.asarray(0.1 * rng.normal(size=leaf.shape), leaf.dtype) for leaf in leaves]
     params = jax.tree.unflatten(tree, leaves)
-    span = (float(problem.train.t[0]), float(problem.train.t[-1]))
-    write_field(tmp_path / "field.npz", span, model.factors(params))
+    span = model.field.span
+    fields.save(tmp_path / "field.npz", model.field, params)
     t = np.linspace(span[0] - 0.1, span[1] + 0.1, 41).astype(np.float32)
     poses = np.asarray(jax.jit(jax.vmap(model.field.pose, (None, 0)))(params, jnp.asarray(t)))
     assert_allclose(numpy_evaluator.load(tmp_path / "field.npz")(t), poses, atol=1e-5)

@@ -16,13 +16,12 @@ import pytest
 from helpers.refused import complaint
 from PIL import Image
 
+from jaxpose import fields
 from jaxpose.datasets.synthetic import RoomConfig, room
 from jaxpose.datasets.types import Recording
-from jaxpose.errors import DataError
 from jaxpose.evaluation import trajectory_error
 from jaxpose.experiments import imu_slam, rgbd_slam
 from jaxpose.experiments.outcome import Outcome
-from jaxpose.experiments.slam import run_files
 from jaxpose.experiments.slam.report import report, table, tracking_update
 from jaxpose.experiments.slam.source import load
 from jaxpose.fields import numpy_evaluator
@@ -97,19 +96,13 @@ def test_numbers_are_those_of_the_files(finished):
 
 def test_a_saved_field_gives_the_trajectory_at_any_time(finished):
     folder, results = finished
-    field, params = run_files.load_field(folder)
+    field, params = fields.load(folder / "field.npz")
     estimate = trajectories.read_tum(folder / "trajectory.txt")
     times = np.concatenate([estimate.t, np.linspace(0, estimate.t[-1], 50)]).astype(np.float32)
     poses = np.asarray(jax.jit(jax.vmap(field.pose, (None, 0)))(params, jnp.asarray(times)))
     distance = np.linalg.norm(poses[:FRAMES, :3, 3] - estimate.T[:, :3, 3], axis=1)
     assert np.sqrt(np.mean(distance**2)) == pytest.approx(results["field_rmse_m"], abs=1e-5)
     np.testing.assert_allclose(numpy_evaluator.load(folder / "field.npz")(times), poses, atol=1e-6)
-
-
-def test_a_field_of_before_is_refused(tmp_path):
-    np.savez(tmp_path / "field.npz", control_points=np.zeros((5, 7)), span=np.zeros(2))
-    with pytest.raises(DataError, match="field.npz: expected a B-spline in a trajectory of version 1"):
-        run_files.load_field(tmp_path)
 
 
 def test_a_run_says_what_camera_it_had(finished):

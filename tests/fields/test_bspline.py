@@ -11,7 +11,7 @@ from scipy.interpolate import BSpline
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from jaxpose.fields import bspline, control_points
+from jaxpose.fields import bspline, control_points, control_points_along
 from jaxpose.fields.derivatives import motion, velocity
 from jaxpose.geometry import se3
 
@@ -122,11 +122,12 @@ def test_control_poses_act_locally():
     assert np.all(change[5:9] > 1e-3)
 
 
-def test_goes_on_beyond_the_span():
-    """Outside, the first and the last cubic continue: a screw stays the screw."""
-    params = jnp.asarray(params_of([screw(t) for t in CONTROLS]), jnp.float32)
-    times = jnp.asarray([FIRST - 0.06, LAST, LAST + 0.04])
-    assert_allclose(poses(params, times), [screw(t) for t in times], atol=1e-5)
+def test_control_poses_along_stamped_ones_are_those_of_their_screw():
+    """At knots between timestamps too, in seconds since 1970; beyond the ends it stands still."""
+    times = 1.7e9 + np.linspace(0, 1, 8)
+    found = control_points_along(times, np.array([screw(FIRST + t) for t in np.linspace(0, 1, 8)]), INTERVALS)
+    expected = params_of([screw(np.clip(t, FIRST, LAST)) for t in CONTROLS])
+    assert_allclose(found, expected, atol=1e-6)
 
 
 def test_control_points_cross_half_a_turn():

@@ -77,7 +77,7 @@ def test_sizes_of_table_12(layers, width, octaves, expected):
 def test_starts_at_the_identity(config):
     field = posenet(config)
     params = jax.jit(field.init)(jax.random.key(0))
-    times = jnp.linspace(*config.span, 7)
+    times = jnp.linspace(*field.span, 7)
     off = np.asarray(jax.jit(jax.vmap(field.pose, in_axes=(None, 0)))(params, times)) - np.eye(4)
     assert 0 < np.max(np.abs(off)) < 2e-4, (
         "not quite the identity, or no gradient would reach the first layers"
@@ -211,7 +211,7 @@ def test_losses_on_translation_do_not_pay_for_rotation():
     params, times = random_params(field), jnp.linspace(-1, 1, 32)
 
     def loss(params, stop=False):
-        pose = partial(field.pose, fields.stop_rotation(params) if stop else params)
+        pose = partial(field.pose, fields.stop_rotation_gradient(params) if stop else params)
         return jnp.sum(jax.vmap(lambda t: pose(t)[:3, 3])(times) ** 2)
 
     both = flops(lambda params: jax.vmap(partial(field.pose, params))(times), params)
@@ -226,9 +226,9 @@ def test_losses_on_translation_do_not_pay_for_rotation():
 
 def test_stopping_the_rotation_leaves_other_parameters_alone():
     coupled = random_params(posenet(PoseNetConfig(coupled=True, **SMALL)))
-    assert fields.stop_rotation(coupled) is coupled
+    assert fields.stop_rotation_gradient(coupled) is coupled
     control_poses = jnp.zeros((5, 7))
-    assert fields.stop_rotation(control_poses) is control_poses
+    assert fields.stop_rotation_gradient(control_poses) is control_poses
 
 
 @pytest.mark.parametrize(
@@ -238,6 +238,7 @@ def test_stopping_the_rotation_leaves_other_parameters_alone():
         (dict(octaves=-1), "octaves >= 0"),
         (dict(layers=0), "layers >= 1"),
         (dict(window=(0.5, 0.1)), "start < end"),
+        (dict(translation_scale=0.0), "more than 0 m"),
     ],
 )
 def test_settings_that_mean_nothing_are_refused(change, message):

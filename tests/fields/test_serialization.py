@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from jaxpose import fields
+from jaxpose.errors import DataError
 from jaxpose.evaluation import trajectory_error
 from jaxpose.fields import PoseNetConfig, numpy_evaluator, serialization
 from jaxpose.geometry import rigid, se3
@@ -38,8 +39,8 @@ def poses_of(field, params, times=TIMES):
     return np.asarray(jax.jit(jax.vmap(field.pose, (None, 0)))(params, jnp.asarray(times)))
 
 
-def assert_agrees(tmp_path, expected, factors, times=TIMES, tolerance=1e-9, **options):
-    serialization.write_field(tmp_path / "field.npz", SPAN, factors, **options)
+def assert_agrees(tmp_path, expected, field, params, times=TIMES, tolerance=1e-9, **options):
+    serialization.save(tmp_path / "field.npz", field, params, **options)
     found = numpy_evaluator.load(tmp_path / "field.npz")(times)
     assert found.dtype == np.float64 and found.shape == (len(times), 4, 4)
     np.testing.assert_allclose(found, expected, atol=tolerance, rtol=0)
@@ -64,21 +65,21 @@ def test_posenet(tmp_path, config):
         params = fields.set_progress(params, jnp.asarray(0.33))
     expected = poses_of(field, params)
     assert np.ptp(expected[:, :3, 3], axis=0).min() > 0.01, "a trajectory at rest would prove little"
-    assert_agrees(tmp_path, expected, [serialization.posenet_factor(config, params)])
+    assert_agrees(tmp_path, expected, field, params)
 
 
 def test_bspline(tmp_path):
     field = fields.bspline(SPAN, 9)
     params = random_like(field.init(jax.random.key(0)), scale=0.6)
-    assert_agrees(tmp_path, poses_of(field, params), [serialization.bspline_factor(SPAN, params)])
+    assert_agrees(tmp_path, poses_of(field, params), field, params)
 
 
-def test_table(tmp_path):
-    field = fields.table(STAMPS)
+def test_per_frame_poses(tmp_path):
+    field = fields.per_frame_poses(STAMPS)
     params = random_like(field.init(jax.random.key(0)), scale=2.0)
     between = np.array([*TIMES, *(STAMPS[1:] + STAMPS[:-1]) / 2])  # on the borders too
     expected = poses_of(field, params, between)
-    assert_agrees(tmp_path, expected, [serialization.per_frame_factor(STAMPS, params)], between)
+    assert_agrees(tmp_path, expected, field, params, between)
 
 
 def turns(angles):
@@ -89,46 +90,35 @@ def turns(angles):
 
 @pytest.mark.parametrize("angles", [[0, 0, 1e-9, 1e-4, 0.3], [0, 3.1, 0.01, 2.9, -0.2], [0, 1, 2, 3, 4]])
 def test_stamped_at_small_and_large_angles(tmp_path, angles):
-    poses, timestamps = turns(angles), jnp.asarray(STAMPS)
-    field = fields.PoseField(lambda key: None, lambda _, t: fields.piecewise_geodesic(timestamps, poses)(t))
-    assert_agrees(tmp_path, poses_of(field, 0), [serialization.piecewise_geodesic_factor(timestamps, poses)])
+    field = fields.piecewise_geodesic(STAMPS, turns(angles))
+    assert_agrees(tmp_path, poses_of(field, {}), field, {})
 
 
-@pytest.mark.parametrize("side", ["body", "world"])
-def test_a_refined_start_and_a_camera_on_a_body(tmp_path, side):
-    config = PoseNetConfig(span=SPAN, layers=3, width=8, translation_scale=2.0)
-    inner, initial = (
-        fields.posenet(config),
-        fields.piecewise_geodesic(jnp.asarray(STAMPS), turns([0, 1, 2, 1, 0])),
-    )
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_a_corrected_start_and_a_camera_on_a_body(tmp_path, side):
+    net = fields.posenet(PoseNetConfig(span=SPAN, layers=3, width=8, translation_scale=2.0))
+    initial = fields.piecewise_geodesic(STAMPS, turns([0, 1, 2, 1, 0]))
     T_body_cam = turns([0, 0.7])[1]
-    refined = fields.refine(inner, initial, side=side)
-    field = refined._replace(
-        pose=lambda params, t: fields.body_to_camera(lambda s: refined.pose(params, s), T_body_cam)(t)
-    )
-    params = random_like(inner.init(jax.random.key(1)))
-    start = serialization.piecewise_geodesic_factor(jnp.asarray(STAMPS), turns([0, 1, 2, 1, 0]))
-    correction = serialization.posenet_factor(config, params)
-    factors = [start, correction] if side == "body" else [correction, start]
-    factors.append(serialization.constant_factor(T_body_cam))
-    expected = poses_of(field, params)
-    assert_agrees(tmp_path, expected, factors)
+    body = (fields.right_correction if side == "right" else fields.left_correction)(net, initial)
+    camera = fields.product(body, fields.constant(T_body_cam))
+    params = random_like(net.init(jax.random.key(1)))
+    T_initial, P = poses_of(initial, {}), poses_of(net, params)
+    expected = (T_initial @ P if side == "right" else P @ T_initial) @ np.asarray(T_body_cam)
+    assert_agrees(tmp_path, expected, camera, (params, {}))
     alignment = rigid.Similarity(2.5, np.asarray(T_body_cam[:3, :3]), np.array([1.0, 2.0, 3.0]))
-    assert_agrees(tmp_path, trajectory_error.align(alignment, expected), factors, alignment=alignment)
+    aligned = trajectory_error.align(alignment, expected)
+    assert_agrees(tmp_path, aligned, camera, (params, {}), alignment=alignment)
 
 
-@pytest.mark.parametrize("kind", ["bspline", "table"])
+@pytest.mark.parametrize("kind", ["bspline", "per_frame_poses"])
 def test_an_alignment_scales_every_family(tmp_path, kind):
-    field = fields.bspline(SPAN, 4) if kind == "bspline" else fields.table(STAMPS)
+    field = fields.bspline(SPAN, 4) if kind == "bspline" else fields.per_frame_poses(STAMPS)
     params = random_like(field.init(jax.random.key(0)))
-    factor = (
-        serialization.bspline_factor(SPAN, params)
-        if kind == "bspline"
-        else serialization.per_frame_factor(STAMPS, params)
-    )
     alignment = rigid.Similarity(0.3, np.asarray(turns([1.0])[0, :3, :3]), np.array([1.0, 2.0, 3.0]))
     expected = trajectory_error.align(alignment, poses_of(field, params))
-    assert_agrees(tmp_path, expected, [factor], alignment=alignment)
+    assert_agrees(tmp_path, expected, field, params, alignment=alignment)
+    loaded, read = serialization.load(tmp_path / "field.npz")
+    np.testing.assert_allclose(poses_of(loaded, read), expected, atol=1e-9)
 
 
 def test_a_field_in_float32_agrees_to_its_rounding(tmp_path):
@@ -138,16 +128,15 @@ def test_a_field_in_float32_agrees_to_its_rounding(tmp_path):
         params = random_like(field.init(jax.random.key(0)), scale=0.1)
         times = np.linspace(0.5, 4, 50).astype(np.float32)
         expected = poses_of(field, params, times)
-        factor = serialization.posenet_factor(config, params)
-    assert_agrees(tmp_path, expected, [factor], times, tolerance=2e-6)
+    assert_agrees(tmp_path, expected, field, params, times, tolerance=2e-6)
 
 
 def test_the_evaluator_is_one_short_file_without_jax(tmp_path):
     """A copy of it alone, in another folder, in a Python that knows nothing of this package."""
     params = jnp.zeros((7, 7)).at[:, 0].set(jnp.arange(7.0))
-    serialization.write_field(tmp_path / "field.npz", SPAN, [serialization.bspline_factor(SPAN, params)])
+    serialization.save(tmp_path / "field.npz", fields.bspline(SPAN, 4), params)
     source = Path(numpy_evaluator.__file__).read_text()
-    assert len(source.splitlines()) < 100
+    assert len(source.splitlines()) < 125
     (tmp_path / "copied.py").write_text(source)
     code = (
         "import sys, copied; print(copied.load('field.npz')([0.5, 4.0])[:, 0, 3].round(6).tolist(), "
@@ -159,10 +148,32 @@ def test_the_evaluator_is_one_short_file_without_jax(tmp_path):
     assert said.stdout == "[1.0, 5.0] []\n"
 
 
+def test_a_window_comes_back_as_far_open_as_it_was(tmp_path):
+    field = fields.posenet(PoseNetConfig(span=SPAN, layers=3, width=8, window=(0.1, 0.5)))
+    params = fields.set_progress(random_like(field.init(jax.random.key(0))), jnp.asarray(0.33))
+    serialization.save(tmp_path / "field.npz", field, params)
+    loaded, read = serialization.load(tmp_path / "field.npz")
+    assert float(read["progress"]) == pytest.approx((0.33 - 0.1) / 0.4)
+    np.testing.assert_allclose(poses_of(loaded, read), poses_of(field, params), atol=1e-9)
+
+
+def test_a_configuration_comes_back_equal(tmp_path):
+    """So that what was compiled for it serves what is loaded."""
+    config = PoseNetConfig(span=SPAN, layers=3, width=8, octaves=2, activation="sigmoid", coupled=True)
+    for field in (fields.posenet(config), fields.bspline(SPAN, 9), fields.per_frame_poses(STAMPS)):
+        serialization.save(tmp_path / "field.npz", field, field.init(jax.random.key(0)))
+        assert serialization.load(tmp_path / "field.npz")[0] == field
+
+
 def test_other_files_are_refused(tmp_path):
     np.savez(tmp_path / "old.npz", control_points=np.zeros((5, 7)), span=np.zeros(2))
-    with pytest.raises(ValueError, match="old.npz: expected a trajectory of version 1, got none"):
-        numpy_evaluator.load(tmp_path / "old.npz")
     np.savez(tmp_path / "new.npz", version=2)
-    with pytest.raises(ValueError, match="version 1, got 2"):
-        numpy_evaluator.load(tmp_path / "new.npz")
+    for name, found in (("old.npz", "got none"), ("new.npz", "got 2")):
+        message = f"{name}: expected a trajectory of version 1, {found}"
+        with pytest.raises(ValueError, match=message):
+            numpy_evaluator.load(tmp_path / name)
+        with pytest.raises(DataError, match=message):
+            serialization.load(tmp_path / name)
+    (tmp_path / "text.npz").write_text("no archive")
+    with pytest.raises(DataError, match="text.npz: expected a trajectory, got"):
+        serialization.load(tmp_path / "text.npz")

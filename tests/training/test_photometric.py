@@ -74,9 +74,10 @@ def test_noisy_poses_are_found_again():
     """The scene known, poses off by 0.1 and 6 degrees: PoseNet brings them back, on either side."""
     ground_truth = np.asarray(around(T), np.float64)
     off = np.asarray(se3.exp(jnp.stack([0.1 * jnp.cos(3 * T), 0.1 * T, 0 * T, 0.1 * T, 0 * T, 0.1 * T], -1)))
-    for side, start in (("world", off @ ground_truth), ("body", ground_truth @ off)):
+    sides = ((fields.left_correction, off @ ground_truth), (fields.right_correction, ground_truth @ off))
+    for side, start in sides:
         net = fields.posenet(fields.PoseNetConfig(octaves=2, layers=3, width=32))
-        field = fields.refine(net, fields.piecewise_geodesic(T, jnp.asarray(start, jnp.float32)), side=side)
+        field = side(net, fields.piecewise_geodesic(T, jnp.asarray(start, jnp.float32)))
         rates = {"translation": Rate(1e-3, 1e-4), "rotation": Rate(1e-3, 1e-4)}
         config = TrainConfig(steps=400, rays=128, samples=48, chunk=64)
         trainer = photometric.trainer(ball_scene(), field, CAMERA, DEPTHS, Rate(0.0, 0.0), rates, config)
@@ -93,7 +94,7 @@ def test_noisy_poses_are_found_again():
 def test_the_loss_is_the_mean_squared_colour_error():
     """Every ray of a one-pixel camera is the same ray, so the loss of a step is known without its draws."""
     pixel = Camera(20.0, 20.0, 0.0, 0.0, 1, 1)
-    field = fields.refine(fields.table(T), fields.piecewise_geodesic(T, around(T)))
+    field = fields.right_correction(fields.per_frame_poses(T), fields.piecewise_geodesic(T, around(T)))
     config = TrainConfig(steps=10, rays=6, samples=400, chunk=4)
     trainer = photometric.trainer(ball_scene(), field, pixel, DEPTHS, Rate(0.0, 0.0), Rate(0.0, 0.0), config)
     grey = Views(T, jnp.full((5, 1, 1, 3), 51, jnp.uint8))
@@ -106,7 +107,7 @@ def test_the_loss_is_the_mean_squared_colour_error():
 
 def test_rates_fall_and_groups_wait():
     """Adam's first step has the length of its rate, whatever the gradient; a waiting group does not move."""
-    field = fields.refine(fields.table(T), fields.piecewise_geodesic(T, around(T)))
+    field = fields.right_correction(fields.per_frame_poses(T), fields.piecewise_geodesic(T, around(T)))
     waits = Rate(np.full((1, 6), 1e-2), 1e-4, np.array([[0.0] * 3 + [0.5] * 3]))
     config = TrainConfig(steps=4, rays=64, samples=8, chunk=64)
     trainer = photometric.trainer(
@@ -139,8 +140,8 @@ def test_windows_follow_the_steps():
 
 def test_steps_are_the_same_in_one_call_or_many_and_never_recompile():
     chex.clear_trace_counter()
-    field = fields.refine(fields.table(T), fields.piecewise_geodesic(T, around(T)))
-    counted = field._replace(pose=chex.assert_max_traces(field.pose, n=4))
+    field = fields.right_correction(fields.per_frame_poses(T), fields.piecewise_geodesic(T, around(T)))
+    counted = field._replace(pose=chex.assert_max_traces(lambda params, t: field.pose(params, t), n=4))
     config = TrainConfig(steps=8, rays=16, samples=8, chunk=16)
     trainer = photometric.trainer(
         ball_scene((0.1, 0, 0)), counted, CAMERA, DEPTHS, Rate(1e-3, 1e-3), Rate(1e-3, 1e-3), config
@@ -173,10 +174,12 @@ def test_sizes_that_mean_nothing(setting):
 
 
 def test_refinement_on_either_side():
-    field = fields.table(T)
+    field = fields.per_frame_poses(T)
     params = jnp.asarray(np.random.default_rng(0).normal(size=(5, 6)), jnp.float32)
     initial = fields.piecewise_geodesic(T, around(T))
-    moves, starts = (np.asarray(jax.jit(jax.vmap(f))(T)) for f in (partial(field.pose, params), initial))
-    for side, expected in (("body", starts @ moves), ("world", moves @ starts)):
-        refined = fields.refine(field, initial, side=side)
+    poses = (partial(field.pose, params), partial(initial.pose, {}))
+    moves, starts = (np.asarray(jax.jit(jax.vmap(pose))(T)) for pose in poses)
+    right, left = fields.right_correction, fields.left_correction
+    for side, expected in ((right, starts @ moves), (left, moves @ starts)):
+        refined = side(field, initial)
         assert_allclose(jax.jit(jax.vmap(partial(refined.pose, params)))(T), expected, atol=1e-5)

@@ -1,7 +1,7 @@
 """Intrinsic motion: how many degrees of freedom a motion has, and the losses that make them few.
 
 A camera's motion from frame to frame is written T = T_o . T_I, a slowly changing frame T_o and a simple
-motion T_I in it (the paper's section 3.3, METHOD section 4); `fields.intrinsic` composes two fields so.
+motion T_I in it (Ma et al. 2024, section 3.3); `fields.intrinsic` composes two fields so.
 """
 
 import jax.numpy as jnp
@@ -14,8 +14,19 @@ THRESHOLD = 0.01  # of a component that counts as a degree of freedom
 def components(T: Float[Array, "*n 4 4"], angle_of_view: float) -> Float[Array, "*n 6"]:
     """[2 alpha / gamma, v / |v|] of motions: Euler angles against half the angle of view, and the direction.
 
-    `angle_of_view` is gamma [rad]; alpha are the angles [rad] of R = R_x R_y R_z. A rotation by 1 turns the
-    middle of the image to its edge. A motion much shorter than a tenth of a millimetre has no direction.
+    A rotation by 1 turns the middle of the image to its edge. A motion much shorter than a tenth of a
+    millimetre has no direction.
+
+    Args:
+        T: motions (..., 4, 4) from frame to frame.
+        angle_of_view: gamma [rad].
+
+    Returns:
+        Components (..., 6); alpha are the angles [rad] of R = R_x R_y R_z (Ma et al. 2024, section 3.3).
+
+    >>> T = jnp.eye(4).at[0, 3].set(0.5)
+    >>> print(components(T, 1.0).round(3) + 0.0)
+    [0. 0. 0. 1. 0. 0.]
     """
     R, v = T[..., :3, :3], T[..., :3, 3]
     alpha = jnp.stack([
@@ -30,19 +41,40 @@ def components(T: Float[Array, "*n 4 4"], angle_of_view: float) -> Float[Array, 
 def effective_dof(
     T: Float[Array, "*n 4 4"], angle_of_view: float, *, threshold: float = THRESHOLD
 ) -> Int[Array, "*n"]:
-    """How many of the six `components` are larger than `threshold` (METHOD section 4, the paper's figure 6).
+    """How many of the six `components` are larger than a threshold (Ma et al. 2024, figure 6).
 
-    The paper does not print its threshold. With 0.01 a rotation counts from a two-hundredth of the angle of
-    view on, 0.3 degrees of 57.
+    Args:
+        T: motions (..., 4, 4) from frame to frame.
+        angle_of_view: [rad].
+        threshold: the paper does not print its own. With 0.01 a rotation counts from a two-hundredth of the
+            angle of view on, 0.3 degrees of 57.
+
+    Returns:
+        Counts (...) from 0 to 6.
     """
     return jnp.sum(jnp.abs(components(T, angle_of_view)) > threshold, axis=-1)
 
 
 def dof_loss(T_inner: Float[Array, "*n 4 4"], angle_of_view: float) -> Float[Array, "*n"]:
-    """L_dof: the L1 norm of the `components` of a motion in the intrinsic frame."""
+    """L_dof: the L1 norm of the `components` of a motion in the intrinsic frame (section 3.3).
+
+    Args:
+        T_inner: motions (..., 4, 4) in the intrinsic frame.
+        angle_of_view: [rad].
+
+    Returns:
+        Losses (...).
+    """
     return jnp.sum(jnp.abs(components(T_inner, angle_of_view)), axis=-1)
 
 
 def outer_loss(T_outer: Float[Array, "*n 4 4"]) -> Float[Array, "*n"]:
-    """L_o: the L1 norm [m] of the intrinsic frame's translation, which leaves the path to T_I."""
+    """L_o: the L1 norm of the intrinsic frame's translation, which leaves the path to T_I (section 3.3).
+
+    Args:
+        T_outer: poses (..., 4, 4) of the intrinsic frame.
+
+    Returns:
+        Losses (...) [m].
+    """
     return jnp.sum(jnp.abs(T_outer[..., :3, 3]), axis=-1)

@@ -4,22 +4,46 @@ import numpy as np
 
 
 def load(path):
-    """The trajectory as a function of times (n,) [s] to poses (n, 4, 4), camera-to-world, all float64."""
+    """The trajectory of a file, in float64.
+
+    Args:
+        path: a `field.npz`.
+
+    Returns:
+        A function of times (n,) [s] to camera-to-world poses (n, 4, 4). Before its first time and after its
+        last, `span` in the file, the trajectory stands still.
+
+    Raises:
+        ValueError: another file.
+    """
     with np.load(path, allow_pickle=False) as file:
         data = {k: v.astype(float) if v.dtype.kind == "f" else v for k, v in file.items()}
     if data.get("version") != 1:
         raise ValueError(f"{path}: expected a trajectory of version 1, got {data.get('version', 'none')}")
     names = [f"{number}." for number in range(data["count"])]
-    parts = [{k.removeprefix(name): v for k, v in data.items() if k.startswith(name)} for name in names]
+    factors = [{k.removeprefix(name): v for k, v in data.items() if k.startswith(name)} for name in names]
 
     def pose(t):
-        t = np.atleast_1d(np.asarray(t, float))
+        t = np.clip(np.atleast_1d(np.asarray(t, float)), *data["span"])
         T = np.tile(np.eye(4), (len(t), 1, 1))
-        for part in parts:
-            T = T @ _KINDS[str(part["kind"])](part, t)
+        for factor in factors:
+            T = T @ evaluate(factor, t)
         return T
 
     return pose
+
+
+def evaluate(factor, t):
+    """One factor of a trajectory.
+
+    Args:
+        factor: its entries in the file, with `kind`, as float64 arrays.
+        t: times (n,) [s] within its span.
+
+    Returns:
+        Poses (n, 4, 4).
+    """
+    return _KINDS[str(factor["kind"])](factor, t)
 
 
 def _posenet(p, t):
@@ -49,11 +73,11 @@ def _bspline(p, t):
     return T
 
 
-def _table(p, t):
+def _per_frame_poses(p, t):
     return p["poses"][np.searchsorted((p["times"][1:] + p["times"][:-1]) / 2, t)]
 
 
-def _stamped(p, t):
+def _piecewise_geodesic(p, t):
     times, poses = p["times"], p["poses"]
     i = np.clip(np.searchsorted(times, t, side="right") - 1, 0, max(len(times) - 2, 0))
     j = np.minimum(i + 1, len(times) - 1)
@@ -94,6 +118,6 @@ def _log(T):
     return np.hstack([np.linalg.solve(_shift(phi), T[:, :3, 3:])[..., 0], phi])
 
 
-_KINDS = {"posenet": _posenet, "bspline": _bspline, "table": _table, "stamped": _stamped}
+_KINDS = {"posenet": _posenet, "bspline": _bspline, "table": _per_frame_poses, "stamped": _piecewise_geodesic}
 _ACTIVATIONS = {"relu": lambda h: np.maximum(h, 0), "softplus": lambda h: np.logaddexp(h, 0)}
 _ACTIVATIONS["sigmoid"] = lambda h: (1 + np.tanh(h / 2)) / 2

@@ -18,13 +18,23 @@ def project_onto_poses(
     steps: int = 6,
     damping: float = 1e-6,
 ) -> Params:
-    """Parameters of a PoseNet at which `poses_of(params)` are the given poses, near those it has.
+    """Parameters of a PoseNet at which it has the given poses, near those that it starts from.
 
     Only the output layers move, in which the network is linear up to its head: each Newton step is the
     shortest change of their weights that brings the poses there to first order, J^T (J J^T)^-1 r. That is
-    closer than hundreds of Adam's steps on all layers, at the cost of a few. Where poses ask for what the
-    features cannot tell apart, `damping` (a share of the mean of J J^T's diagonal) lets them differ a
-    little. The poses must be the field's own: a common factor that cancels in them would be free to run away.
+    closer than hundreds of Adam's steps on all layers, at the cost of a few.
+
+    Args:
+        poses_of: `params -> (k, 4, 4)`, the field's own poses at some times: a common factor that cancels in
+            them would be free to run away.
+        params: where to start.
+        poses: the poses (k, 4, 4) to come to.
+        steps: Newton's.
+        damping: a share of the mean of J J^T's diagonal, which lets poses differ a little where they ask for
+            what the features cannot tell apart.
+
+    Returns:
+        Parameters of the same tree.
     """
     leaves, tree = jax.tree_util.tree_flatten_with_path(params)
     last = _output_layers([path for path, _ in leaves])

@@ -3,7 +3,7 @@
 The pose at time t is a product of factors, factor 0 . factor 1 . ..., camera-to-world. The file holds
 
     version     1, that of this description
-    span        (2,) the first and last time [s] that the trajectory was made for
+    span        (2,) the first and last time [s]; before and after it the trajectory stands still
     count       how many factors there are; each entry of factor K is named "K." and then
     kind        "posenet", "bspline", "table" or "stamped"
 
@@ -15,100 +15,94 @@ The pose at time t is a product of factors, factor 0 . factor 1 . ..., camera-to
     bspline     span [s]; control_points (n, 7): position and quaternion wxyz less (1, 0, 0, 0), the first one
                 knot interval before the span
     table       times (n,) [s]; poses (n, 4, 4): that of the nearest timestamp, the earlier of two equally
-    near stamped     times (n,) [s]; poses (n, 4, 4): constant twist between timestamps, at rest before and
-    after
-
-Other compositions (`fields/composition.py`) are products too: a constant pose is a `piecewise_geodesic` with
-one timestamp.
+                near (`fields.per_frame_poses`)
+    stamped     times (n,) [s]; poses (n, 4, 4): constant twist between timestamps, at rest before and
+                after (`fields.piecewise_geodesic`; with one timestamp `fields.constant`)
 """
 
-from collections.abc import Mapping, Sequence
+import zipfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from jaxtyping import Array, Float
 
-from jaxpose import nn
-from jaxpose.fields._posenet import PoseNetConfig
-from jaxpose.fields.types import Params
+from jaxpose.errors import DataError
+from jaxpose.fields import _bspline, _per_frame, _posenet, composition
+from jaxpose.fields.types import Factor, Params, PoseField
 from jaxpose.files.atomic import atomic
-from jaxpose.geometry import se3
 from jaxpose.geometry.rigid import Similarity
 
 VERSION = 1
-Factor = Mapping[str, Any]  # the entries of the file that are named for it
+_FROM_FACTOR = {
+    "posenet": _posenet.from_factor,
+    "bspline": _bspline.from_factor,
+    "table": _per_frame.from_factor,
+    "stamped": composition.from_factor,
+}
 
 
-def write_field(
-    path: Path | str,
-    span: tuple[float, float],
-    factors: Sequence[Factor],
-    *,
-    alignment: Similarity | None = None,
-) -> None:
-    """Write the product of `factors`, moved by an `alignment` as `metrics.align` moves poses."""
+def save(path: Path | str, field: PoseField, params: Params, *, alignment: Similarity | None = None) -> None:
+    """Write a field with its parameters to a file, as this module describes it.
+
+    Args:
+        path: a name that ends in `.npz`.
+        field: any field of this package or composition of such; `PoseField(init, pose)` of functions alone
+            cannot be saved.
+        params: its parameters.
+        alignment: what the poses are moved by, as `trajectory_error.align` does: scaled, turned and moved.
+
+    Raises:
+        ValueError: the field, or a part of it, has no description.
+    """
+    if field.description is None:
+        raise ValueError("save: expected a field with a description, got one of functions alone")
+    factors = field.description.factors(params)
     if alignment is not None:
         T = np.eye(4)
         T[:3, :3], T[:3, 3] = alignment.rotation, alignment.translation
-        factors = [constant_factor(T), *(_scaled(factor, alignment.scale) for factor in factors)]
+        moved = {"kind": "stamped", "times": np.zeros(1), "poses": T[None]}
+        factors = (moved, *(_scaled(factor, alignment.scale) for factor in factors))
     entries = {f"{k}.{name}": value for k, factor in enumerate(factors) for name, value in factor.items()}
     with atomic(path) as temporary:
         np.savez(
             temporary,
             allow_pickle=False,
             version=VERSION,
-            span=np.asarray(span, np.float64),
+            span=np.asarray(field.span, np.float64),
             count=len(factors),
             **entries,
         )
 
 
-def posenet_factor(config: PoseNetConfig, params: Params) -> Factor:
-    """The PoseNet of `fields.posenet(config)` with these parameters."""
-    weights = np.ones(config.octaves)
-    if config.window is not None:
-        weights = np.asarray(nn.window_weights(params["progress"], config.octaves, config.window))
-    layers = {
-        f"{network}.{layer.removeprefix('layer_')}.{name}": np.asarray(value)
-        for network in ("translation", "rotation", "coupled")
-        if network in params
-        for layer, arrays in params[network].items()
-        for name, value in arrays.items()
-    }
-    return {
-        "kind": "posenet",
-        "span": np.asarray(config.span, np.float64),
-        "weights": weights,
-        "activation": config.activation,
-        "head": config.head,
-        "translation_scale": np.float64(config.translation_scale),
-        **layers,
-    }
+def load(path: Path | str) -> tuple[PoseField, Params]:
+    """The field and the parameters of a file that `save` wrote.
 
+    Args:
+        path: a `field.npz`, such as every run leaves.
 
-def bspline_factor(span: tuple[float, float], params: Float[Array, "n 7"]) -> Factor:
-    """The spline of `fields.bspline(span, n - 3)` with these parameters."""
-    return {
-        "kind": "bspline",
-        "span": np.asarray(span, np.float64),
-        "control_points": np.asarray(params),
-    }
+    Returns:
+        The field and its parameters in the default floating-point type: the field itself where the file holds
+        one factor, else a `fields.product`. What only concerns how it was trained is not in the file.
 
-
-def per_frame_factor(times: Float[np.ndarray, " n"], params: Float[Array, "n 6"]) -> Factor:
-    """The table of `fields.table(times)` with these parameters."""
-    return {"kind": "table", "times": np.asarray(times, np.float64), "poses": np.asarray(se3.exp(params))}
-
-
-def piecewise_geodesic_factor(times: Float[Array, " n"], poses: Float[Array, "n 4 4"]) -> Factor:
-    """The motion of `fields.stamped(times, poses)`."""
-    return {"kind": "stamped", "times": np.asarray(times), "poses": np.asarray(poses)}
-
-
-def constant_factor(T: Float[Array | np.ndarray, "4 4"]) -> Factor:
-    """A pose that does not move, such as a camera's in the body."""
-    return {"kind": "stamped", "times": np.zeros(1), "poses": np.asarray(T)[None]}
+    Raises:
+        DataError: the file holds no trajectory of this version.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            data = dict(file)
+    except (ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise DataError(f"{path}: expected a trajectory, got {' '.join(str(error).split())}") from None
+    if data.get("version") != VERSION:
+        found = data.get("version", "none")
+        raise DataError(f"{path}: expected a trajectory of version {VERSION}, got {found}")
+    parts = []
+    for number in range(int(data["count"])):
+        name = f"{number}."
+        factor = {k.removeprefix(name): value for k, value in data.items() if k.startswith(name)}
+        parts.append(_FROM_FACTOR[str(factor["kind"])](factor))
+    if len(parts) == 1:
+        return parts[0]
+    fields, params = zip(*parts, strict=True)
+    return composition.product(*fields), params
 
 
 def _scaled(factor: Factor, scale: float) -> Factor:

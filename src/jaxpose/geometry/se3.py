@@ -14,7 +14,10 @@ import math
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
+
+from jaxpose._checks import check_shapes
 
 _TERMS = 9  # leaves less than 1e-15 of each series below 1, second derivatives included
 # (1 - cos x)/x^2 and (x - sin x)/x^3 in x^2
@@ -41,7 +44,7 @@ def hat(omega: Float[Array, "*n 3"]) -> Float[Array, "*n 3 3"]:
      [ 3.  0. -1.]
      [-2.  1.  0.]]
     """
-    _require("hat", omega=(omega, 3))
+    _require(omega=(omega, 3))
     x, y, z = (omega[..., i] for i in range(3))
     zero = jnp.zeros_like(x)
     return jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*omega.shape, 3)
@@ -59,7 +62,7 @@ def vee(W: Float[Array, "*n 3 3"]) -> Float[Array, "*n 3"]:
     >>> print(vee(hat(jnp.array([1.0, 2.0, 3.0]))))
     [1. 2. 3.]
     """
-    _require("vee", W=(W, 3, 3))
+    _require(W=(W, 3, 3))
     return 0.5 * jnp.stack(
         [W[..., 2, 1] - W[..., 1, 2], W[..., 0, 2] - W[..., 2, 0], W[..., 1, 0] - W[..., 0, 1]], axis=-1
     )
@@ -79,7 +82,7 @@ def so3_exp(phi: Float[Array, "*n 3"]) -> Float[Array, "*n 3 3"]:
      [ 1.  0.  0.]
      [ 0.  0.  1.]]
     """
-    _require("so3_exp", phi=(phi, 3))
+    _require(phi=(phi, 3))
     return _rotation(phi, *_exp_coefficients(_dot(phi, phi))[:2])
 
 
@@ -95,7 +98,7 @@ def so3_log(R: Float[Array, "*n 3 3"]) -> Float[Array, "*n 3"]:
     >>> print(so3_log(so3_exp(jnp.array([0.0, 0.5, 0.0]))).round(6) + 0.0)
     [0.  0.5 0. ]
     """
-    _require("so3_log", R=(R, 3, 3))
+    _require(R=(R, 3, 3))
     return _quaternion_log(rotation_to_quaternion(R))[0]
 
 
@@ -114,7 +117,7 @@ def exp(xi: Float[Array, "*n 6"]) -> Float[Array, "*n 4 4"]:
      [0. 0. 1. 3.]
      [0. 0. 0. 1.]]
     """
-    _require("exp", xi=(xi, 6))
+    _require(xi=(xi, 6))
     rho, phi = xi[..., :3], xi[..., 3:]
     square = _dot(phi, phi)
     a, b, c = _exp_coefficients(square)
@@ -134,7 +137,7 @@ def log(T: Float[Array, "*n 4 4"]) -> Float[Array, "*n 6"]:
     >>> print(log(exp(jnp.array([1.0, 2.0, 3.0, 0.0, 0.5, 0.0]))).round(5) + 0.0)
     [1.  2.  3.  0.  0.5 0. ]
     """
-    _require("log", T=(T, 4, 4))
+    _require(T=(T, 4, 4))
     phi, half_cot = _quaternion_log(rotation_to_quaternion(T[..., :3, :3]))
     square = _dot(phi, phi)
     near = square < 1
@@ -161,12 +164,10 @@ def make(rotation: Float[Array, "*n 3 3"], translation: Float[Array, "*n 3"]) ->
      [0. 0. 1. 3.]
      [0. 0. 0. 1.]]
     """
-    _require("make", rotation=(rotation, 3, 3), translation=(translation, 3))
+    _require(rotation=(rotation, 3, 3), translation=(translation, 3))
     if rotation.shape[:-2] != translation.shape[:-1]:
-        raise ValueError(
-            f"make: expected rotation and translation with the same leading axes, got {rotation.shape} and "
-            f"{translation.shape}"
-        )
+        found = f"{rotation.shape} and {translation.shape}"
+        raise ValueError(f"rotation, translation: expected the same leading axes, got {found}")
     upper = jnp.concatenate([rotation, translation[..., None]], axis=-1)
     last = jnp.broadcast_to(jnp.eye(4, dtype=upper.dtype)[3:], (*upper.shape[:-2], 1, 4))
     return jnp.concatenate([upper, last], axis=-2)
@@ -185,7 +186,7 @@ def compose(T_a_b: Float[Array, "*#n 4 4"], T_b_c: Float[Array, "*#n 4 4"]) -> F
     >>> print(T[:3, 3])
     [1. 2. 0.]
     """
-    _require("compose", T_a_b=(T_a_b, 4, 4), T_b_c=(T_b_c, 4, 4))
+    _require(T_a_b=(T_a_b, 4, 4), T_b_c=(T_b_c, 4, 4))
     return _product(T_a_b, T_b_c)
 
 
@@ -201,7 +202,7 @@ def inverse(T_a_b: Float[Array, "*n 4 4"]) -> Float[Array, "*n 4 4"]:
     >>> print(inverse(exp(jnp.array([1.0, 2.0, 3.0, 0.0, 0.0, 0.0])))[:3, 3])
     [-1. -2. -3.]
     """
-    _require("inverse", T_a_b=(T_a_b, 4, 4))
+    _require(T_a_b=(T_a_b, 4, 4))
     R_b_a = jnp.swapaxes(T_a_b[..., :3, :3], -1, -2)
     return make(R_b_a, -_rotate(R_b_a, T_a_b[..., :3, 3]))
 
@@ -219,7 +220,7 @@ def apply(T_a_b: Float[Array, "*#n 4 4"], point_b: Float[Array, "*#n 3"]) -> Flo
     >>> print(apply(exp(jnp.array([1.0, 2.0, 3.0, 0.0, 0.0, 0.0])), jnp.array([0.5, 0.0, 0.0])))
     [1.5 2.  3. ]
     """
-    _require("apply", T_a_b=(T_a_b, 4, 4), point_b=(point_b, 3))
+    _require(T_a_b=(T_a_b, 4, 4), point_b=(point_b, 3))
     rotated = _rotate(T_a_b[..., :3, :3], point_b)
     return rotated + jnp.broadcast_to(T_a_b[..., :3, 3], rotated.shape)
 
@@ -233,7 +234,7 @@ def adjoint(T_a_b: Float[Array, "*n 4 4"]) -> Float[Array, "*n 6 6"]:
     Returns:
         Matrices (..., 6, 6) on twists [translation, rotation] (Sola et al. 2018, eq. 31).
     """
-    _require("adjoint", T_a_b=(T_a_b, 4, 4))
+    _require(T_a_b=(T_a_b, 4, 4))
     R = T_a_b[..., :3, :3]
     upper = jnp.concatenate([R, _product(hat(T_a_b[..., :3, 3]), R)], axis=-1)
     lower = jnp.concatenate([jnp.zeros_like(R), R], axis=-1)
@@ -256,10 +257,10 @@ def interpolate(
     >>> print(log(interpolate(jnp.eye(4), T, jnp.array(0.25))).round(5) + 0.0)
     [0.25 0.   0.   0.   0.   0.5 ]
     """
-    _require("interpolate", T_w_a=(T_w_a, 4, 4), T_w_b=(T_w_b, 4, 4))
+    _require(T_w_a=(T_w_a, 4, 4), T_w_b=(T_w_b, 4, 4))
     batch = jnp.broadcast_shapes(T_w_a.shape[:-2], T_w_b.shape[:-2])
     if batch and fraction.shape and fraction.shape != batch:
-        raise ValueError(f"interpolate: fraction: expected shape {batch}, got {fraction.shape}")
+        raise ValueError(f"fraction: expected shape {batch}, got {fraction.shape}")
     return compose(T_w_a, exp(fraction[..., None] * log(compose(inverse(T_w_a), T_w_b))))
 
 
@@ -276,7 +277,7 @@ def quaternion_multiply(a: Float[Array, "*#n 4"], b: Float[Array, "*#n 4"]) -> F
     >>> print(quaternion_multiply(i, j))
     [0. 0. 0. 1.]
     """
-    _require("quaternion_multiply", a=(a, 4), b=(b, 4))
+    _require(a=(a, 4), b=(b, 4))
     (aw, ax, ay, az), (bw, bx, by, bz) = ([q[..., i] for i in range(4)] for q in jnp.broadcast_arrays(a, b))
     return jnp.stack(
         [
@@ -298,7 +299,7 @@ def quaternion_conjugate(q: Float[Array, "*n 4"]) -> Float[Array, "*n 4"]:
     Returns:
         Quaternions wxyz (..., 4).
     """
-    _require("quaternion_conjugate", q=(q, 4))
+    _require(q=(q, 4))
     return jnp.concatenate([q[..., :1], -q[..., 1:]], axis=-1)
 
 
@@ -314,7 +315,7 @@ def quaternion_exp(phi: Float[Array, "*n 3"]) -> Float[Array, "*n 4"]:
     >>> print(quaternion_exp(jnp.array([0.0, 0.0, jnp.pi])).round(6) + 0.0)
     [0. 0. 0. 1.]
     """
-    _require("quaternion_exp", phi=(phi, 3))
+    _require(phi=(phi, 3))
     square = 0.25 * _dot(phi, phi)
     a, b, _ = _exp_coefficients(square)
     return jnp.concatenate([1 - b * square, 0.5 * a * phi], axis=-1)
@@ -334,7 +335,7 @@ def quaternion_to_rotation(q: Float[Array, "*n 4"]) -> Float[Array, "*n 3 3"]:
      [0. 1. 0.]
      [0. 0. 1.]]
     """
-    _require("quaternion_to_rotation", q=(q, 4))
+    _require(q=(q, 4))
     w, v = q[..., :1], q[..., 1:]
     return _rotation(v, 2 * w / _dot(q, q), 2 / _dot(q, q))
 
@@ -351,7 +352,7 @@ def rotation_to_quaternion(R: Float[Array, "*n 3 3"]) -> Float[Array, "*n 4"]:
     >>> print(rotation_to_quaternion(jnp.eye(3)))
     [1. 0. 0. 0.]
     """
-    _require("rotation_to_quaternion", R=(R, 3, 3))
+    _require(R=(R, 3, 3))
     xx, yy, zz = (R[..., i, i] for i in range(3))
     xy, yz, zx = (R[..., i, j] + R[..., j, i] for i, j in ((0, 1), (1, 2), (2, 0)))
     wx, wy, wz = (R[..., j, i] - R[..., i, j] for i, j in ((1, 2), (2, 0), (0, 1)))
@@ -371,20 +372,15 @@ def rotation_to_quaternion(R: Float[Array, "*n 3 3"]) -> Float[Array, "*n 4"]:
     return q * (jnp.where(q[..., :1] < 0, -1, 1) / jnp.sqrt(_dot(q, q)))
 
 
-def _require(function: str, **arguments: tuple) -> None:
+def _require(**arguments: tuple) -> None:
     """Raise ValueError unless each argument has its last axes and the leading ones of all broadcast."""
-    leading = {}
-    for name, (array, *last) in arguments.items():
-        shape = jnp.shape(array)
-        if shape[-len(last) :] != tuple(last):
-            expected = ", ".join(["...", *map(str, last)])
-            raise ValueError(f"{function}: {name}: expected shape ({expected}), got {shape}")
-        leading[name] = shape[: len(shape) - len(last)]
+    check_shapes(**{name: (x, f"*n {' '.join(map(str, last))}") for name, (x, *last) in arguments.items()})
+    leading = [np.shape(x)[: -len(last)] for x, *last in arguments.values()]
     try:
-        jnp.broadcast_shapes(*leading.values())
+        np.broadcast_shapes(*leading)
     except ValueError:
-        found = ", ".join(f"{name} {shape}" for name, shape in leading.items())
-        raise ValueError(f"{function}: expected leading axes that broadcast, got {found}") from None
+        names, found = ", ".join(arguments), " and ".join(map(str, leading))
+        raise ValueError(f"{names}: expected leading axes that broadcast, got {found}") from None
 
 
 def _quaternion_log(q: Float[Array, "*n 4"]) -> tuple[Float[Array, "*n 3"], Float[Array, "*n 1"]]:

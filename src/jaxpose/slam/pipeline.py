@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 
 from jaxpose.datasets.types import Frame, Recording, check_frame
 from jaxpose.errors import DataError
-from jaxpose.fields import Params, PoseField, bspline, control_points_along, fit
+from jaxpose.fields import Params, PoseField, bspline, fit
 from jaxpose.geometry import rigid
 from jaxpose.geometry.camera import Camera, angle_of_view
 from jaxpose.imu import GRAVITY_WORLD, Gravity, Imu
@@ -318,8 +318,7 @@ def _finish(state: SlamState, read: FrameReader) -> SlamResult:
     T_world_cam, t = frames.T_world_body @ state.T_body_cam, frames.t - frames.t[0]
     intervals = max(round(t[-1] / float(np.median(np.diff(t)))), 1)
     field = bspline((0.0, float(t[-1])), intervals)
-    start = control_points_along(t, T_world_cam, intervals)
-    fitted = fit(field, t, T_world_cam, params=start, steps=400, learning_rate=1e-3)
+    fitted = fit(field, t, T_world_cam)
     config, blocks = _as_blocks(state)
     keyframes = keyframe_images(read, np.flatnonzero(frames.keyframe), T_world_cam)
     texture = make_texture(config, blocks, keyframes, state.camera)

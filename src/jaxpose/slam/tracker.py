@@ -251,10 +251,13 @@ def _problem(
     config, t, T_world_body, last = state.config, frames.t, frames.T_world_body, frames.count - 2
     behind = [max(last - k, 0) for k in range(BEHIND + 1)]  # the last frame itself, and those before
     past = rigid.inverse(T_world_body[last]) @ T_world_body[behind]
+    timestamps = np.concatenate([predicted.timestamps, t[behind] - t[last]])
+    # A field stands still outside of its span, 4 intervals: after a gap these are longer.
+    interval_s = max(float(np.median(np.diff(t))), float(np.abs(timestamps).max()) / 4 * (1 + 1e-6))
     where = reference_frame(
         config.frame,
         since_first_s=t[last] - t[0],
-        interval_s=float(np.median(np.diff(t))),
+        interval_s=interval_s,
         duration_s=state.duration_s,
         T_world_ref=T_world_body[last],
         T_world_first=T_world_body[0],
@@ -264,7 +267,7 @@ def _problem(
     imu = state.imu if config.uses_gyroscope else None
     return TrackingProblem(
         as_float(predicted.dt),
-        as_float(np.concatenate([predicted.timestamps, t[behind] - t[last]])),
+        as_float(timestamps),
         as_float(np.concatenate([predicted.T_ref_body, past])),
         as_float(predicted.sigma),
         predicted.readings,

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, PRNGKeyArray
 from scipy.ndimage import median_filter
 
 from jaxpose import fields
@@ -20,7 +20,6 @@ from jaxpose.errors import DataError
 from jaxpose.evaluation import trajectory_error
 from jaxpose.fields import Params, PoseField, PoseNetConfig
 from jaxpose.fields.derivatives import motion
-from jaxpose.fields.serialization import Factor, bspline_factor, posenet_factor
 from jaxpose.files.trajectories import Trajectory
 from jaxpose.geometry import rigid
 from jaxpose.imu import Imu, ImuNoise
@@ -28,7 +27,6 @@ from jaxpose.imu import Imu, ImuNoise
 _SHARE = 0.95  # of the power of the speeds, below what is called the motion's bandwidth
 _NOISY = 0.8  # share of the highest frequency from where on poses are taken to hold nothing but noise
 _BIAS_WEIGHT = 1e-3  # of a square m/s^2 of bias beside one of a reading
-_NET_RATE, _SPLINE_RATE = 1e-3, 3e-3  # Adam's, at first
 
 
 class Candidate(NamedTuple):
@@ -37,9 +35,7 @@ class Candidate(NamedTuple):
     name: str
     highest_hz: float  # the fastest motion that it carries
     make: Callable[[tuple[float, float]], PoseField]
-    start: Callable[[PoseField, Trajectory], Params]
-    rate: float  # Adam's, at first
-    factor: Callable[[tuple[float, float], Params], Factor]
+    key: PRNGKeyArray | None  # draws the start
 
 
 class Frame(NamedTuple):
@@ -65,9 +61,7 @@ def posenet(span_s: float, octaves: int, layers: int, width: int, seed: int) -> 
         f"PoseNet F={octaves} {layers}x{width}",
         2.0 ** (octaves - 1) / span_s if octaves else 0.5 / span_s,
         lambda span: fields.posenet(config(span)),
-        lambda field, trajectory: field.init(jax.random.key(seed)),
-        _NET_RATE,
-        lambda span, params: posenet_factor(config(span), params),
+        jax.random.key(seed),
     )
 
 
@@ -79,9 +73,7 @@ def bspline(span_s: float, knots_hz: float) -> Candidate:
         f"B-spline {knots_hz:g} knots/s",
         knots_hz / 2,
         lambda span: fields.bspline(span, intervals),
-        lambda field, trajectory: fields.control_points_along(trajectory.t, trajectory.T, intervals),
-        _SPLINE_RATE,
-        bspline_factor,
+        None,
     )
 
 
@@ -100,25 +92,23 @@ def fit_field(
     around: Frame,
     imu: Imu | None,
     steps: int,
-) -> tuple[Fitted, Factor]:
+) -> tuple[Fitted, PoseField, Params]:
     """Fit to the poses that are not `held`, and measure on those that are, and on all of the IMU's readings.
 
-    The field comes back as a factor of a field file, in the units of `around`. The trajectory's body is the
+    The field comes back on the trajectory's clock, in the units of `around`. The trajectory's body is the
     IMU; `imu.t` is on the trajectory's clock, within its span.
     """
     started = time.perf_counter()
     local = _into(around, trajectory)
     seen = Trajectory(local.t[~held], local.T[~held])
     field = candidate.make((0.0, float(local.t[-1])))
-    start = candidate.start(field, seen)
-    result = fields.fit(field, seen.t, seen.T, params=start, steps=steps, learning_rate=candidate.rate)
+    result = fields.fit(field, seen.t, seen.T, key=candidate.key, steps=steps)
     params = jax.block_until_ready(result.params)
     seconds = time.perf_counter() - started
     poses = jax.jit(jax.vmap(field.pose, (None, 0)))  # parameters as constants would be worked on for seconds
     T = np.asarray(poses(params, jnp.asarray(local.t[held], jnp.float32)), np.float64)
     distance = around.scale * np.linalg.norm(T[:, :3, 3] - local.T[held, :3, 3], axis=1)
     angle = np.degrees(rigid.rotation_angle(T[:, :3, :3], local.T[held, :3, :3]))
-    span = (around.t0, around.t0 + float(local.t[-1]))
     fitted = Fitted(
         candidate.name,
         candidate.highest_hz,
@@ -128,7 +118,7 @@ def fit_field(
         trajectory_error.statistics(angle),
         None if imu is None else _inertial(field, params, around, imu),
     )
-    return fitted, candidate.factor(span, params)
+    return fitted, fields.shifted(field, around.t0), params
 
 
 def readings(folder: Path, trajectory: Trajectory) -> tuple[Imu, Sensor, tuple[str, ...]]:

@@ -99,12 +99,13 @@ def run(config: Config, on_update: OnUpdate = silent) -> Result:
     if not chosen:
         raise DataError(f"{source}: expected more poses for these B-splines, got {rate_hz:.3g} Hz")
     around = fit_candidates.frame(trajectory)
-    fitted, factors = [], []
+    fitted: list[Fitted] = []
+    found: list[tuple[Any, Any]] = []
     for number, candidate in enumerate(chosen):
         on_update(Update(f"fitting {candidate.name}, {number + 1} of {len(chosen)} fields"))
-        field, factor = fit_candidates.fit_field(candidate, trajectory, held, around, imu, config.steps)
-        fitted.append(field)
-        factors.append(factor)
+        one = fit_candidates.fit_field(candidate, trajectory, held, around, imu, config.steps)
+        fitted.append(one[0])
+        found.append(one[1:])
     off = np.array(
         [f.translation_m.median / around.scale + np.radians(f.rotation_deg.median) for f in fitted]
     )
@@ -112,7 +113,7 @@ def run(config: Config, on_update: OnUpdate = silent) -> Result:
     bandwidth_hz = fit_candidates.bandwidth_hz(trajectory)
     slow = [f.highest_hz < bandwidth_hz and x > _SLOW * off.min() for f, x in zip(fitted, off, strict=True)]
     if config.out is not None:
-        _write(config.out, trajectory, factors[best], Similarity(around.scale, np.eye(3), around.middle))
+        _write(config.out, *found[best], Similarity(around.scale, np.eye(3), around.middle))
         notes += (f"{fitted[best].name} written to {config.out}, seconds as in {config.trajectory.name}",)
     return Result(
         source,
@@ -207,12 +208,12 @@ def _candidates(config: Config, span_s: float, rate_hz: float) -> tuple[list, tu
     return chosen, tuple(f"no B-spline of {hz:g} knots/s: {why}" for hz in dense)
 
 
-def _write(out: Path, trajectory: Trajectory, factor: Any, moved: Similarity) -> None:
+def _write(out: Path, field: Any, params: Any, moved: Similarity) -> None:
     """A fitted field as a file."""
-    from jaxpose.fields.serialization import write_field
+    from jaxpose.fields import save
 
     out.parent.mkdir(parents=True, exist_ok=True)
-    write_field(out, (float(trajectory.t[0]), float(trajectory.t[-1])), [factor], alignment=moved)
+    save(out, field, params, alignment=moved)
 
 
 def _trajectory(config: Config) -> tuple[str, Trajectory]:

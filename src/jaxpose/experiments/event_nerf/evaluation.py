@@ -1,6 +1,7 @@
 """How good a training on events is: pose errors over the motion, held-out views after a correction."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -72,7 +73,7 @@ def find_truth(problem: Problem) -> GroundTruth | None:
         return None
     at = during[np.unique(np.linspace(0, len(during) - 1, min(len(during), _MOST_POSES)).round().astype(int))]
     start = piecewise_geodesic(*(jnp.asarray(x, jnp.float32) for x in problem.start))
-    T_start = jax.jit(jax.vmap(start))(jnp.asarray(recording.t[at], jnp.float32))
+    T_start = jax.jit(jax.vmap(partial(start.pose, {})))(jnp.asarray(recording.t[at], jnp.float32))
     return GroundTruth(recording.t[at], recording.T_world_cam[at], np.asarray(T_start, np.float64))
 
 

@@ -1,6 +1,5 @@
 """What is trained in the event experiment: scene, pose field and their rates, by preset."""
 
-from collections.abc import Callable
 from dataclasses import asdict, replace
 from typing import Any, NamedTuple
 
@@ -11,8 +10,7 @@ import numpy as np
 from jaxpose import events, fields
 from jaxpose.experiments.event_nerf.options import Config, Problem
 from jaxpose.experiments.training_loop import CHUNK
-from jaxpose.fields import Params, PoseField, PoseNetConfig
-from jaxpose.fields.serialization import Factor, piecewise_geodesic_factor, posenet_factor
+from jaxpose.fields import PoseField, PoseNetConfig
 from jaxpose.scenes import NerfConfig, SceneField, nerf
 from jaxpose.training import events as event_training
 from jaxpose.training.events import EventData, EventTrainConfig
@@ -51,7 +49,6 @@ class Model(NamedTuple):
 
     scene: SceneField
     field: PoseField
-    factors: Callable[[Params], tuple[Factor, ...]]  # of the field, for `serialization.write_field`
     rates: dict[str, Rate]  # of the scene and, where it moves, of the parts of the pose field
     train: EventTrainConfig
     trainer: Trainer
@@ -77,7 +74,7 @@ def build(config: Config, problem: Problem) -> Model:
         longest_s=longest_s,
         background=problem.background,
     )
-    field, factors, pose_rates = _field(config, problem, plan)
+    field, pose_rates = _field(config, problem, plan)
     scene_rate = Rate(5e-4, 5e-4) if paper else Rate(1e-3, 1e-4)
     trainer = event_training.trainer(
         scene, field, recording.camera, problem.depths, span, scene_rate, pose_rates, train
@@ -85,7 +82,6 @@ def build(config: Config, problem: Problem) -> Model:
     return Model(
         scene,
         field,
-        factors,
         {"scene": scene_rate, **pose_rates},
         train,
         trainer,
@@ -112,14 +108,11 @@ def _preset(config: Config, problem: Problem) -> Preset:
     return _FAST_PRESETS["all" if problem.slides else "axis" if config.axis_offset_deg else "positions"]
 
 
-def _field(
-    config: Config, problem: Problem, plan: Preset
-) -> tuple[PoseField, Callable[[Params], tuple[Factor, ...]], dict[str, Rate]]:
-    """The trajectory as a field and as factors of its file, and the rates of its parameters."""
-    t, T_start = (jnp.asarray(x, jnp.float32) for x in problem.start)
-    initial, start = fields.piecewise_geodesic(t, T_start), piecewise_geodesic_factor(t, T_start)
+def _field(config: Config, problem: Problem, plan: Preset) -> tuple[PoseField, dict[str, Rate]]:
+    """The trajectory as a field, and the rates of its parameters."""
+    initial = fields.piecewise_geodesic(*(jnp.asarray(x, jnp.float32) for x in problem.start))
     if config.pose == "linear":
-        return PoseField(lambda key: {}, lambda params, t: initial(t)), lambda params: (start,), {}
+        return initial, {}
     net = replace(config.net, layers=2, width=32) if config.smoke else config.net
     posenet = PoseNetConfig(span=problem.span, translation_scale=problem.extent / 2, **asdict(net))
     rates = {"translation": plan.translation, "rotation": plan.rotation}
@@ -128,8 +121,7 @@ def _field(
     if config.net.window is not None:
         rates = rates | {"progress": Rate(1.0, 1.0)}
     # On the camera's side a wrong axis is a constant, and a chord of the circle comes near and goes away.
-    field = fields.refine(fields.posenet(posenet), initial, side="body")
-    return field, lambda params: (start, posenet_factor(posenet, params)), rates
+    return fields.right_correction(fields.posenet(posenet), initial), rates
 
 
 def _data(problem: Problem) -> EventData:

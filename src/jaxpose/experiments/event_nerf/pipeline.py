@@ -35,7 +35,7 @@ from jaxpose.experiments.event_nerf.report import describe_step, report, table
 from jaxpose.experiments.outcome import Outcome
 from jaxpose.experiments.progress import OnUpdate, Update, silent
 from jaxpose.experiments.training_loop import Loaded, Trained
-from jaxpose.fields.serialization import write_field
+from jaxpose.fields import save
 from jaxpose.files import atomic, run_folder, trajectories
 from jaxpose.files.camera_json import write_camera
 from jaxpose.plots import events as event_plots
@@ -201,5 +201,5 @@ def _write_poses(folder: Path, problem: Problem, model: Model, state: State, mea
     )
     trajectories.write_tum(folder / "trajectory.txt", trajectories.Trajectory(t, estimate))
     trajectories.write_tum(folder / "start.txt", problem.start)
-    write_field(folder / "field.npz", problem.span, model.factors(state.pose), alignment=measured.alignment)
+    save(folder / "field.npz", model.field, state.pose, alignment=measured.alignment)
     write_camera(folder / "camera.json", recording.camera, (), ".")

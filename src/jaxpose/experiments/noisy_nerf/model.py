@@ -1,9 +1,7 @@
 """What is trained in the noisy-pose experiment: scene, pose field, their rates, by preset and name."""
 
 import warnings
-from collections.abc import Callable
 from dataclasses import asdict, replace
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -15,14 +13,7 @@ from scipy.interpolate import make_splrep
 from jaxpose import fields
 from jaxpose.experiments.noisy_nerf.options import Config, Problem
 from jaxpose.experiments.training_loop import CHUNK
-from jaxpose.fields import Params, PoseField, PoseNetConfig
-from jaxpose.fields.serialization import (
-    Factor,
-    bspline_factor,
-    per_frame_factor,
-    piecewise_geodesic_factor,
-    posenet_factor,
-)
+from jaxpose.fields import PoseField, PoseNetConfig
 from jaxpose.scenes import NerfConfig, SceneField, nerf
 from jaxpose.training.photometric import Depths, TrainConfig, Views, trainer
 from jaxpose.training.steps import Rate, Trainer
@@ -57,7 +48,6 @@ class Model(NamedTuple):
 
     scene: SceneField
     field: PoseField
-    factors: Callable[[Params], tuple[Factor, ...]]  # of the field, for `serialization.write_field`
     scene_rates: Rate
     pose_rates: Any
     train: TrainConfig
@@ -81,16 +71,14 @@ def build(config: Config, problem: Problem) -> Model:
     else:
         scene_rates = Rate(5e-4, 1e-4) if barf == "depth" else Rate(1e-3, 1e-4)
     t = jnp.asarray(photographs.t, jnp.float32)
-    field, factor, rates = _field(config, problem)
-    T_start = jnp.asarray(problem.T_start, jnp.float32)
-    start = piecewise_geodesic_factor(t, T_start)
-    world = config.side == "world"
-    field = fields.refine(field, fields.piecewise_geodesic(t, T_start), side="world" if world else "body")
+    correction, rates = _field(config, problem)
+    start = fields.piecewise_geodesic(t, jnp.asarray(problem.T_start, jnp.float32))
+    correct = fields.left_correction if config.side == "world" else fields.right_correction
+    field = correct(correction, start)
     depths = Depths(photographs.near, photographs.far, photographs.spacing)
     return Model(
         scene,
         field,
-        lambda params: (factor(params), start) if world else (start, factor(params)),
         scene_rates,
         rates,
         train,
@@ -142,8 +130,8 @@ def describe(config: Config, model: Model) -> dict[str, Any]:
     }
 
 
-def _field(config: Config, problem: Problem) -> tuple[PoseField, Callable[[Params], Factor], Any]:
-    """The correction of the poses by itself, as a field and as a factor of its file, and its rates."""
+def _field(config: Config, problem: Problem) -> tuple[PoseField, Any]:
+    """The correction of the poses by itself, and its rates."""
     photographs, paper = problem.train, config.preset == "paper"
     span = (float(photographs.t[0]), float(photographs.t[-1]))
     shift_from, turn_from = (0.0, 0.0) if paper else (_SHIFT_FROM, _TURN_FROM)
@@ -154,25 +142,22 @@ def _field(config: Config, problem: Problem) -> tuple[PoseField, Callable[[Param
         scale = photographs.near if config.noise == "unknown" else problem.extent / 2
         net = replace(config.net, layers=2, width=32) if config.smoke else config.net
         posenet = PoseNetConfig(span=span, translation_scale=scale, **asdict(net))
-        factor = partial(posenet_factor, posenet)
         shift, turn = _NET_RATES["paper" if paper else start]
         rates = {"translation": Rate(*shift, shift_from), "rotation": Rate(*turn, turn_from)}
         if config.net.coupled:
             rates = {"coupled": rates["rotation"]}
         rates = rates if config.net.window is None else rates | {"progress": Rate(1.0, 1.0)}
-        return fields.posenet(posenet), factor, rates
+        return fields.posenet(posenet), rates
     if paper:
         shift = turn = (3e-3 if photographs.spacing == "disparity" else 1e-3, 1e-5)
     else:
         shift, turn = _PER_FRAME_RATES[start]
     if config.pose == "bspline":
         field, columns = fields.bspline(span, config.spline_knots), (3, 4)
-        factor = partial(bspline_factor, span)
     else:
-        field, columns = fields.table(photographs.t), (3, 3)
-        factor = partial(per_frame_factor, photographs.t)
+        field, columns = fields.per_frame_poses(photographs.t), (3, 3)
     pairs = zip((*shift, shift_from), (*turn, turn_from), strict=True)
-    return field, factor, Rate(*(np.repeat(pair, columns)[None] for pair in pairs))
+    return field, Rate(*(np.repeat(pair, columns)[None] for pair in pairs))
 
 
 def _fast_scene(config: Config) -> NerfConfig:

@@ -37,7 +37,7 @@ from jaxpose.experiments.noisy_nerf.report import describe_step, report, table
 from jaxpose.experiments.outcome import Outcome
 from jaxpose.experiments.progress import OnUpdate, Update, silent
 from jaxpose.experiments.training_loop import Loaded, Trained
-from jaxpose.fields.serialization import write_field
+from jaxpose.fields import save
 from jaxpose.files import atomic, run_folder, trajectories
 from jaxpose.files.camera_json import write_camera
 from jaxpose.plots import nerf as nerf_plots
@@ -145,9 +145,7 @@ def _single(
     on_update(Update("drawing figures"))
     _draw(folder, config, problem, measured, trained)
     _write_poses(folder, config, problem, measured)
-    span = (float(problem.train.t[0]), float(problem.train.t[-1]))
-    factors = model.factors(trained.state.pose)
-    write_field(folder / "field.npz", span, factors, alignment=measured.alignment)
+    save(folder / "field.npz", model.field, trained.state.pose, alignment=measured.alignment)
     results = training_loop.results_of(
         "noisy_nerf",
         config,

@@ -48,7 +48,7 @@ def motion_warps(pose: Pose, patches: int, net: PoseNetConfig) -> Warps:
     elif pose == "bspline":
         field, rates, decay = fields.bspline((-1.0, 1.0), SPLINE_KNOTS - 1), _BARF, 0.03
     else:
-        field, rates, decay = fields.table(timestamps), _BARF, 0.03
+        field, rates, decay = fields.per_frame_poses(timestamps), _BARF, 0.03
 
     def warps(params):
         if pose in ("per_frame", "spline_reset"):

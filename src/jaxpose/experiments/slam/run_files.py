@@ -4,12 +4,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from jaxpose.datasets.types import Recording
-from jaxpose.errors import DataError
 from jaxpose.experiments.progress import OnUpdate, Update
 from jaxpose.experiments.slam.evaluation import (
     Measured,
@@ -23,8 +21,7 @@ from jaxpose.experiments.slam.map_file import SavedMap, write_map
 from jaxpose.experiments.slam.map_rendering import Renderer, renderer, views
 from jaxpose.experiments.slam.options import Options
 from jaxpose.experiments.slam.source import Source
-from jaxpose.fields import Params, PoseField, bspline
-from jaxpose.fields.serialization import bspline_factor, write_field
+from jaxpose.fields import save
 from jaxpose.files import atomic, trajectories
 from jaxpose.files.camera_json import write_camera
 from jaxpose.files.ply import write_ply
@@ -72,35 +69,13 @@ def write_run(
     return found, np.full(len(recording.t), np.nan) if errors is None else errors.translation_m
 
 
-def load_field(folder: Path | str) -> tuple[PoseField, Params]:
-    """The continuous trajectory of a run.
-
-    Args:
-        folder: its run folder.
-
-    Returns:
-        A field and its parameters: `field.pose(params, t)` is T_world_cam at `t` [s], on the clock of
-        `trajectory.txt`, between its first and last time.
-
-    Raises:
-        DataError: for the folder of no SLAM run, or of one of before version 1 of `field.npz`.
-    """
-    path = Path(folder) / "field.npz"
-    with np.load(path) as file:
-        if "0.control_points" not in file:
-            raise DataError(f"{path}: expected a B-spline in a trajectory of version 1, got neither")
-        params, (first, last) = jnp.asarray(file["0.control_points"], jnp.float32), file["0.span"]
-    return bspline((float(first), float(last)), params.shape[0] - 3), params
-
-
 def _write_trajectory(folder: Path, recording: Recording, result: SlamResult) -> None:
     """The poses of the frames, the ground truth, and the continuous trajectory."""
     t, ground_truth = recording.t, recording.T_world_cam
     trajectories.write_tum(folder / "trajectory.txt", trajectories.Trajectory(t, result.T_world_cam))
     if ground_truth is not None:
         trajectories.write_tum(folder / "reference.txt", trajectories.Trajectory(t, ground_truth))
-    span = (float(t[0]), float(t[-1]))
-    write_field(folder / "field.npz", span, [bspline_factor(span, result.field_params)])
+    save(folder / "field.npz", result.field, result.field_params)
 
 
 def _write_surface(folder: Path, recording: Recording, result: SlamResult) -> tuple[str, ...]:

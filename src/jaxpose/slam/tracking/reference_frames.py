@@ -17,6 +17,8 @@ from jaxpose.fields import Params, PoseField, PoseFn, PoseNetConfig, anchored, i
 from jaxpose.geometry import rigid
 from jaxpose.slam.config import FrameName
 
+_INSIDE = 1 - 1e-6  # of the field's span: at its end float32 may round to beyond, where a field stands still
+
 
 class ReferenceFrame(NamedTuple):
     """Where the field stands against the last frame: its reference there, and its clock."""
@@ -97,7 +99,7 @@ def reference_frame(
         T_ref_field = rigid.inverse(T_world_ref) @ T_world_first
     elif name == "random":
         T_ref_field = _perturbation(generator)
-    clock, rate = (0.0, 1 / interval_s) if name == "anchored" else (since_first_s, 1 / duration_s)
+    clock, rate = (0.0, 1 / interval_s) if name == "anchored" else (since_first_s, _INSIDE / duration_s)
     return ReferenceFrame(*(jnp.asarray(x, jnp.float32) for x in (T_ref_field, clock, rate)))
 
 
