@@ -22,12 +22,12 @@ from jaxpose.geometry.camera import Camera
 from jaxpose.training import events as event_training
 from jaxpose.training.events import EventData, EventTrainConfig
 from jaxpose.training.photometric import Depths
-from jaxpose.training.steps import Rate, Trainer
+from jaxpose.training.steps import Decay, Trainer, adam
 
 WIDTH, HEIGHT = 346, 260
 CAMERA = Camera(400.0, 400.0, 172.5, 129.5, WIDTH, HEIGHT)
 SPAN = (0.0, 10.0)
-RATES = {"translation": Rate(2e-4, 2e-6), "rotation": Rate(5e-5, 5e-7)}
+RATES = {"translation": Decay(2e-4, 2e-6), "rotation": Decay(5e-5, 5e-7)}
 
 
 @dataclass(frozen=True)
@@ -62,9 +62,8 @@ def trainer(loss: event_training.Loss, config: Config, chunk: int) -> Trainer:
     start = jnp.eye(4).at[2, 3].set(-4.0)
     field = fields.right_correction(field, fields.constant(start))
     train = EventTrainConfig(events=config.events, samples=config.samples, chunk=chunk, loss=loss)
-    return event_training.trainer(
-        scenes.nerf(), field, CAMERA, Depths(2.0, 6.0), SPAN, Rate(5e-4, 5e-4), RATES, train
-    )
+    optimizer = adam({"scene": 5e-4, "pose": RATES}, train.steps)
+    return event_training.trainer(scenes.nerf(), field, CAMERA, Depths(2.0, 6.0), SPAN, optimizer, train)
 
 
 def main() -> None:

@@ -20,7 +20,7 @@ from jaxpose.files import run_folder
 from jaxpose.geometry.camera import Camera
 from jaxpose.training import photometric
 from jaxpose.training.photometric import Depths, TrainConfig, Views
-from jaxpose.training.steps import Rate, Trainer
+from jaxpose.training.steps import Decay, Trainer, adam
 
 SIZE, IMAGES = 400, 100
 CAMERA = Camera(555.6, 555.6, 199.5, 199.5, SIZE, SIZE)
@@ -40,13 +40,14 @@ class Config:
 def trainer(pose: str, config: TrainConfig) -> Trainer:
     t = np.arange(float(IMAGES))
     if pose == "table":
-        field, rates = fields.per_frame_poses(t), Rate(1e-3, 1e-5)
+        field, rates = fields.per_frame_poses(t), Decay(1e-3, 1e-5)
     else:
         field = fields.posenet(fields.PoseNetConfig(span=(0.0, t[-1])))
-        rates = {"translation": Rate(1e-3, 1e-5), "rotation": Rate(2e-4, 1e-6)}
+        rates = {"translation": Decay(1e-3, 1e-5), "rotation": Decay(2e-4, 1e-6)}
     start = jnp.eye(4).at[2, 3].set(-4.0)
     field = fields.right_correction(field, fields.constant(start))
-    return photometric.trainer(scenes.nerf(), field, CAMERA, DEPTHS, Rate(5e-4, 1e-4), rates, config)
+    optimizer = adam({"scene": Decay(5e-4, 1e-4), "pose": rates}, config.steps)
+    return photometric.trainer(scenes.nerf(), field, CAMERA, DEPTHS, optimizer, config)
 
 
 def main() -> None:

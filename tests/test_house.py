@@ -42,12 +42,7 @@ SILENT = {f"{room}.{name}" for room, names in {
         "remove_gravity residual_sigmas retract rotate simulate simulate_from_poses transition windows"
     ),
     "jaxpose": "weighted_mean",
-    "scenes": "bounding_grid grid grow image merge nerf node_positions node_shape trilinear",
     "slam": "finish load run save",
-    "training": (
-        "asynchronous_pairs draw_depths joint microbatched_sum pixel_ray ray_colour trainer viewer "
-        "window_pairs"
-    ),
 }.items() for name in names.split()}  # fmt: skip
 
 

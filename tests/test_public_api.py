@@ -11,6 +11,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
 import jaxpose
@@ -92,6 +93,20 @@ def test_a_trajectory_is_fitted_and_asked_a_thousand_times():
     expected = jaxpose.se3.exp(jnp.outer(jnp.linspace(0.0, 2.0, 1000), TURNING))
     assert np.abs(found.pose - expected).max() < 1e-5
     assert np.abs(found.omega_body - TURNING[None, 3:]).max() < 1e-4
+
+
+def test_a_gyroscope_loss_of_ones_own_with_optax():
+    times, rate = jnp.linspace(0.0, 2.0, 50), lambda t: jnp.stack([0 * t, 0 * t, jnp.sin(3 * t)])
+    field = jaxpose.bspline((0.0, 2.0), intervals=12)
+
+    def loss(params, step):
+        omega = jax.vmap(lambda t: jaxpose.motion(partial(field.pose, params), t).omega_body)(times)
+        return jnp.mean((omega - jax.vmap(rate)(times)) ** 2)
+
+    tx = optax.adam(optax.exponential_decay(0.05, 500, 0.01))
+    params = jax.jit(lambda p: jaxpose.optim.minimize(loss, p, tx, 500).params)(field.init(jax.random.key(0)))
+    turn = field.pose(params, jnp.float32(0))[:3, :3].T @ field.pose(params, jnp.float32(2))[:3, :3]
+    assert np.arctan2(turn[1, 0], turn[0, 0]) == pytest.approx((1 - np.cos(6)) / 3, abs=5e-3)
 
 
 def test_a_ray_through_a_density_of_ones_own():

@@ -82,7 +82,7 @@ def test_the_default_has_barfs_number_of_parameters_and_its_draw():
 
 
 def test_quiet_bands_start_at_zero_and_wake():
-    config = NerfConfig(**{**vars(SMALL), "quiet": True})
+    config = NerfConfig(**{**vars(SMALL), "zero_bands": True})
     params = set_progress(nerf(config).init(jax.random.key(0)), jnp.ones(()))
     loud = nerf(SMALL).init(jax.random.key(0))
     for name, first in (("layer_0", 3), ("layer_2", 12 + 3), ("colour_0", 12 + 3)):

@@ -5,6 +5,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
@@ -18,7 +19,7 @@ from jaxpose.training import events as event_training
 from jaxpose.training import photometric
 from jaxpose.training.events import EventData, EventTrainConfig, asynchronous_pairs, trainer, window_pairs
 from jaxpose.training.photometric import Depths, TrainConfig
-from jaxpose.training.steps import Rate
+from jaxpose.training.steps import Decay, adam
 
 HEIGHT, WIDTH = 6, 8
 CAMERA = Camera(10.0, 10.0, 3.5, 2.5, WIDTH, HEIGHT)
@@ -132,9 +133,8 @@ def test_the_loss_is_small_for_the_true_scene_and_path_and_grows_with_either_wro
     config = EventTrainConfig(
         steps=100, events=256, samples=64, loss=loss, threshold=0.02, longest_s=0.5, background=background
     )
-    at_rest = Rate(1e-30, 1e-30)
     field = PoseField(lambda key: jnp.ones(()), lambda speed, t: path(speed * t))
-    trained = trainer(scene, field, CAMERA, depths, (0.0, 1.0), at_rest, at_rest, config)
+    trained = trainer(scene, field, CAMERA, depths, (0.0, 1.0), optax.set_to_zero(), config)
 
     def measured(speed, brightness=1.0):
         start = trained.start(jax.random.key(0))
@@ -160,9 +160,8 @@ def test_a_path_is_found_from_events(seen, loss):
         return se3.exp(jnp.concatenate([params * t, jnp.stack([0 * t, 0.05 * t, 0 * t])]))
 
     field = PoseField(lambda key: jnp.zeros(3), pose)
-    trained = trainer(
-        scene, field, CAMERA, depths, (0.0, 1.0), Rate(1e-30, 1e-30), Rate(1e-2, 1e-3), config
-    )  # fmt: skip
+    optimizer = adam({"scene": 0.0, "pose": Decay(1e-2, 1e-3)}, config.steps)
+    trained = trainer(scene, field, CAMERA, depths, (0.0, 1.0), optimizer, config)
     state, losses = trained.advance(trained.start(jax.random.key(0)), data, 200)
     assert_allclose(state.pose, [0.3, 0.1, 0.0], atol=0.05)
     assert losses[-20:].mean() < 0.2 * losses[:5].mean()
@@ -180,9 +179,8 @@ def test_a_posenet_and_a_radiance_field_train_on_events_without_a_nan(seen):
     config = EventTrainConfig(steps=4, events=16, samples=8, chunk=8, background=background)
     scene = scenes.nerf(NerfConfig(layers=2, width=16, skip=None, colour_width=8, octaves=3))
     net = fields.posenet(fields.PoseNetConfig(span=(0.0, 1.0), layers=2, width=16))
-    rates = {"translation": Rate(1e-3, 1e-4), "rotation": Rate(1e-3, 1e-4)}
     trained = event_training.trainer(
-        scene, net, CAMERA, depths, (0.0, 1.0), Rate(1e-3, 1e-4), rates, config
+        scene, net, CAMERA, depths, (0.0, 1.0), optax.adam(1e-3), config
     )  # fmt: skip
     state, losses = trained.advance(trained.start(jax.random.key(1)), data, 4)
     assert np.isfinite(losses).all()

@@ -6,6 +6,7 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
@@ -15,7 +16,7 @@ from jaxpose.geometry.camera import Camera
 from jaxpose.scenes import NerfConfig
 from jaxpose.training import photometric
 from jaxpose.training.photometric import Depths, TrainConfig, Views
-from jaxpose.training.steps import Rate
+from jaxpose.training.steps import Decay, adam
 
 CAMERA = Camera(20.0, 22.0, 7.5, 5.5, 16, 12)
 DEPTHS = Depths(1.0, 5.0)
@@ -78,9 +79,9 @@ def test_noisy_poses_are_found_again():
     for side, start in sides:
         net = fields.posenet(fields.PoseNetConfig(octaves=2, layers=3, width=32))
         field = side(net, fields.piecewise_geodesic(T, jnp.asarray(start, jnp.float32)))
-        rates = {"translation": Rate(1e-3, 1e-4), "rotation": Rate(1e-3, 1e-4)}
+        optimizer = adam({"scene": 0.0, "pose": Decay(1e-3, 1e-4)}, 400)
         config = TrainConfig(steps=400, rays=128, samples=48, chunk=64)
-        trainer = photometric.trainer(ball_scene(), field, CAMERA, DEPTHS, Rate(0.0, 0.0), rates, config)
+        trainer = photometric.trainer(ball_scene(), field, CAMERA, DEPTHS, optimizer, config)
         state, losses = trainer.advance(trainer.start(jax.random.key(0)), views(), 400)
         found = np.asarray(jax.vmap(field.pose, (None, 0))(state.pose, T), np.float64)
         before = np.linalg.norm(start[:, :3, 3] - ground_truth[:, :3, 3], axis=-1).mean()
@@ -96,7 +97,7 @@ def test_the_loss_is_the_mean_squared_colour_error():
     pixel = Camera(20.0, 20.0, 0.0, 0.0, 1, 1)
     field = fields.right_correction(fields.per_frame_poses(T), fields.piecewise_geodesic(T, around(T)))
     config = TrainConfig(steps=10, rays=6, samples=400, chunk=4)
-    trainer = photometric.trainer(ball_scene(), field, pixel, DEPTHS, Rate(0.0, 0.0), Rate(0.0, 0.0), config)
+    trainer = photometric.trainer(ball_scene(), field, pixel, DEPTHS, optax.set_to_zero(), config)
     grey = Views(T, jnp.full((5, 1, 1, 3), 51, jnp.uint8))
     _, losses = trainer.advance(trainer.start(jax.random.key(0)), grey, 4)
     look = photometric.viewer(ball_scene(), pixel, DEPTHS, TrainConfig(samples=400)).image
@@ -105,14 +106,14 @@ def test_the_loss_is_the_mean_squared_colour_error():
     assert errors.min() - 1e-3 < losses.min() and losses.max() < errors.max() + 1e-3
 
 
-def test_rates_fall_and_groups_wait():
+def test_rates_decay_and_groups_wait():
     """Adam's first step has the length of its rate, whatever the gradient; a waiting group does not move."""
     field = fields.right_correction(fields.per_frame_poses(T), fields.piecewise_geodesic(T, around(T)))
-    waits = Rate(np.full((1, 6), 1e-2), 1e-4, np.array([[0.0] * 3 + [0.5] * 3]))
+    shift, turn = Decay(1e-2, 1e-4).schedule(4), Decay(1e-2, 1e-4, start=0.5).schedule(4)
+    columns = jnp.arange(6)[None] < 3
+    optimizer = adam({"scene": 1e-3, "pose": lambda step: jnp.where(columns, shift(step), turn(step))}, 4)
     config = TrainConfig(steps=4, rays=64, samples=8, chunk=64)
-    trainer = photometric.trainer(
-        ball_scene((0.1, 0.1, 0.1)), field, CAMERA, DEPTHS, Rate(1e-3, 1e-3), waits, config
-    )
+    trainer = photometric.trainer(ball_scene((0.1, 0.1, 0.1)), field, CAMERA, DEPTHS, optimizer, config)
     states = [trainer.start(jax.random.key(0))]
     for _ in range(4):
         states.append(trainer.advance(states[-1], views(), 1)[0])
@@ -120,9 +121,37 @@ def test_rates_fall_and_groups_wait():
     assert_allclose(moves[0, :, :3], 1e-2, rtol=0.02)
     assert_array_equal(moves[:2, :, 3:], 0)
     assert (moves[2:, :, 3:] > 0).all()
-    assert moves[3].max() < 1e-2 * 1e-2 ** (3 / 4) * 4, "rates fall by a hundred"
+    assert moves[3].max() < 1e-2 * 1e-2 ** (3 / 4) * 4, "rates decay to a hundredth"
     centres = np.diff([np.asarray(state.scene["centre"]) for state in states], axis=0)
     assert_allclose(np.abs(centres[0]), 1e-3, rtol=0.02)
+
+
+@pytest.mark.parametrize("start", [0.0, 0.03, 0.06, 0.3, 1.0])
+def test_a_decay_is_a_power_of_the_share_of_the_training(start, dtype):
+    steps = np.arange(5000)
+    share = steps / 5000
+    expected = np.where(share >= start, 3e-4 * (2e-5 / 3e-4) ** share, 0)
+    with jax.numpy_dtype_promotion("standard"):
+        found = jax.vmap(Decay(3e-4, 2e-5, start).schedule(5000))(jnp.asarray(steps))
+    assert_allclose(found, expected, rtol=1e-5 if dtype == jnp.float32 else 1e-12)
+
+
+def test_parts_have_optimizers_of_their_own():
+    """Any optax transformation: plain descent moves by rate times gradient, and a frozen part not at all."""
+    field = fields.right_correction(fields.per_frame_poses(T), fields.piecewise_geodesic(T, around(T)))
+    parts = {"scene": optax.sgd(1e-2), "pose": optax.set_to_zero()}
+    optimizer = optax.partition(parts, {"scene": "scene", "pose": "pose"})
+    config = TrainConfig(steps=1, rays=64, samples=8, chunk=64)
+    trainer = photometric.trainer(ball_scene((0.1, 0.1, 0.1)), field, CAMERA, DEPTHS, optimizer, config)
+    start = trainer.start(jax.random.key(0))
+    after, (loss,) = trainer.advance(start, views(), 1)
+    moved = np.asarray(after.scene["centre"] - start.scene["centre"])
+    assert_array_equal(after.pose, start.pose)
+    # Downhill, by the rate times the slope: the same draws again, from further along.
+    again = trainer.start(jax.random.key(0))
+    again = again._replace(scene={"centre": start.scene["centre"] + 1e-2 * moved})
+    slope = float(trainer.advance(again, views(), 1)[1][0] - loss) / (1e-2 * np.linalg.norm(moved))
+    assert_allclose(-1e-2 * slope, np.linalg.norm(moved), rtol=0.05)
 
 
 def test_windows_follow_the_steps():
@@ -131,8 +160,7 @@ def test_windows_follow_the_steps():
     )
     field = fields.posenet(fields.PoseNetConfig(octaves=2, layers=2, width=8, window=(0.0, 1.0)))
     config = TrainConfig(steps=4, rays=8, samples=4, chunk=8)
-    rates = Rate(1e-3, 1e-3)
-    trainer = photometric.trainer(scene, field, CAMERA, DEPTHS, rates, rates, config)
+    trainer = photometric.trainer(scene, field, CAMERA, DEPTHS, optax.adam(1e-3), config)
     state, _ = trainer.advance(trainer.start(jax.random.key(0)), views(), 3)
     # That of the last step, 2 of 4; Adam has not moved what has no gradient.
     assert float(state.scene["progress"]) == 0.5 and float(state.pose["progress"]) == 0.5
@@ -143,9 +171,7 @@ def test_steps_are_the_same_in_one_call_or_many_and_never_recompile():
     field = fields.right_correction(fields.per_frame_poses(T), fields.piecewise_geodesic(T, around(T)))
     counted = field._replace(pose=chex.assert_max_traces(lambda params, t: field.pose(params, t), n=4))
     config = TrainConfig(steps=8, rays=16, samples=8, chunk=16)
-    trainer = photometric.trainer(
-        ball_scene((0.1, 0, 0)), counted, CAMERA, DEPTHS, Rate(1e-3, 1e-3), Rate(1e-3, 1e-3), config
-    )
+    trainer = photometric.trainer(ball_scene((0.1, 0, 0)), counted, CAMERA, DEPTHS, optax.adam(1e-3), config)
     data = views()
     once, all_losses = trainer.advance(trainer.start(jax.random.key(3)), data, 8)
     again = trainer.start(jax.random.key(3))
@@ -155,14 +181,13 @@ def test_steps_are_the_same_in_one_call_or_many_and_never_recompile():
     assert_allclose(once.pose, again.pose, atol=1e-7)
 
 
-def test_a_held_out_pose_settles():
-    look = photometric.viewer(
-        ball_scene(), CAMERA, DEPTHS, TrainConfig(rays=128, samples=32, chunk=64), settle_rate=3e-3
-    )
+def test_a_held_out_pose_is_refined():
+    config = TrainConfig(rays=128, samples=32, chunk=64)
+    look = photometric.viewer(ball_scene(), CAMERA, DEPTHS, config, refine_optimizer=optax.adam(3e-3))
     ground_truth = around(T)[2]
     rgb = jnp.asarray(np.round(255 * photographs(ground_truth[None])[0]), jnp.uint8)
     start = se3.compose(se3.exp(jnp.asarray([0.05, -0.05, 0.0, 0.03, 0.0, 0.02])), ground_truth)
-    moved = look.settle({"centre": jnp.zeros(3)}, start, rgb, jax.random.key(0))
+    moved = look.refine_pose({"centre": jnp.zeros(3)}, start, rgb, jax.random.key(0))
     off = lambda pose: float(jnp.linalg.norm(se3.log(se3.compose(se3.inverse(ground_truth), pose))))
     assert off(moved) < 0.5 * off(start)
 

@@ -210,7 +210,7 @@ class Loaded(Generic[P, M]):
 
 def load_run(
     folder: Path | str,
-    config_type: Callable[..., Any],
+    config_type: type[Any],
     load: Callable[[Any], P],
     build: Callable[[Any, P], M],
 ) -> Loaded[P, M]:

@@ -36,12 +36,20 @@ class ImageConfig:
 
 
 def image(config: ImageConfig = ImageConfig()) -> ImageField:  # noqa: B008 - frozen
-    """A perceptron on encoded coordinates (PEERS B1).
+    """A perceptron on encoded coordinates, BARF's for planar alignment (Lin et al. 2021, section 4.1).
 
-    The parameters are a dict with the network's weights under `mlp` and, with a `window`, `progress`, which
-    `fields.set_progress` sets and no gradient reaches. Weights and biases are drawn from U(+-1/sqrt(inputs)),
-    those of the first layer, most of whose inputs the window shuts at first, from a range sqrt(inputs / 2)
-    wider. Raises ValueError for a configuration that means nothing.
+    Weights and biases are drawn from U(+-1/sqrt(inputs)), those of the first layer, most of whose inputs the
+    window shuts at first, from a range sqrt(inputs / 2) wider.
+
+    Args:
+        config: Size of the network, octaves of its encoding, coarse-to-fine window.
+
+    Returns:
+        The image. Its parameters are a dict with the network's weights under `mlp` and, with a `window`,
+        `progress`, which `fields.set_progress` sets and no gradient reaches.
+
+    Raises:
+        ValueError: For sizes below 1, negative octaves, and a window that does not increase.
     """
     if config.octaves < 0 or config.layers < 1 or config.width < 1:
         raise ValueError(f"expected octaves >= 0, layers >= 1 and width >= 1, got {config}")

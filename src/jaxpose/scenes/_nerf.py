@@ -1,4 +1,4 @@
-"""NeRF's perceptron with BARF's coarse-to-fine encoding: the scene of the paper's section 4.1 (PEERS B1)."""
+"""NeRF's perceptron with BARF's coarse-to-fine encoding: the scene of Ma et al. 2024, section 4.1."""
 
 import math
 from dataclasses import dataclass
@@ -25,9 +25,9 @@ class NerfConfig:
     direction_octaves: int = 4
     # Coarse-to-fine on both encodings, as fractions of the training; None: all bands from the start.
     window: tuple[float, float] | None = (0.1, 0.5)
-    # Whether the weights of the encodings' bands start at zero. A band that opens is then silent at first; in
-    # a short training, which has no time to get used to it, it would else be noise that poses run after.
-    quiet: bool = False
+    # Whether the weights of the encodings' bands start at zero. A band that opens then changes nothing at
+    # first; in a short training, which has no time to adapt, it would else be noise that poses run after.
+    zero_bands: bool = False
 
     def __post_init__(self):
         if (
@@ -43,18 +43,31 @@ class NerfConfig:
 
 
 def nerf(config: NerfConfig = NerfConfig()) -> SceneField:  # noqa: B008 - frozen
-    """Density per unit of length (softplus) and colour (sigmoid) of a point seen along a direction.
+    """A radiance field: NeRF's perceptron (Mildenhall et al. 2020) with BARF's encoding (Lin et al. 2021).
 
-    The direction's length does not matter; points are not normalised: the lowest band of their encoding has
-    a period of 2 units. Parameters are a dict of layers `{"kernel", "bias"}`; with a `window` there is also
-    `progress`, which `fields.set_progress` sets and no gradient reaches. Xavier-uniform with BARF's gains.
+    Density is per unit of length (softplus), colour in [0, 1] (sigmoid). The direction's length does not
+    matter; points are not normalised: the lowest band of their encoding has a period of 2 units. Weights
+    start Xavier-uniform with BARF's gains.
+
+    Args:
+        config: Sizes of the network, octaves of the encodings, coarse-to-fine window.
+
+    Returns:
+        The scene. Its parameters are a dict of layers `{"kernel", "bias"}`; with a `window` there is also
+        `progress`, which `fields.set_progress` sets and no gradient reaches.
+
+    >>> scene = nerf(NerfConfig(layers=2, width=16, skip=None, colour_width=8))
+    >>> params = scene.init(jax.random.key(0))
+    >>> density, rgb = scene.query(params, jnp.zeros(3), jnp.array([0.0, 0.0, 1.0]))
+    >>> print(density.shape, rgb.shape)
+    () (3,)
     """
     sizes = _sizes(config)
 
     def init(key):
         keys = dict(zip(sizes, jax.random.split(key, len(sizes)), strict=True))
         params: dict = {name: _draw(keys[name], *size) for name, size in sizes.items()}
-        if config.quiet:
+        if config.zero_bands:
             for name, bands in _bands(config).items():
                 params[name]["kernel"] = params[name]["kernel"].at[bands].set(0)
         return params if config.window is None else params | {"progress": jnp.zeros(())}

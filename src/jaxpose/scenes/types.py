@@ -11,9 +11,10 @@ Params = Any
 class SceneField(NamedTuple):
     """A scene as two pure functions, in the manner of `optax.adam`.
 
-    `init(key)` returns a parameter pytree; `query(params, point, direction)` is what stands at a point of the
-    world [m] seen along a direction: its geometry (a volume density or a signed distance; the family says
-    which, and `render.py` has the weights that fit) and its colour in [0, 1].
+    `init(key)` returns a parameter pytree. `query(params, point, direction)` returns geometry and colour at
+    one point of the world, seen along a direction: geometry is a volume density or a signed distance (the
+    family says which, and `render` has the weights that fit), colour is in [0, 1]. For many points,
+    `jax.vmap`.
     """
 
     init: Callable[[PRNGKeyArray], Params]

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Real
 
+from jaxpose._checks import check_finite, check_shapes
 from jaxpose.scenes.types import Params, SceneField
 
 RATIO = 4
@@ -41,8 +42,20 @@ class GridConfig:
 def grid(config: GridConfig) -> SceneField:
     """Signed distance [m], positive in front of surfaces, and colour on nested grids.
 
-    Trilinear between nodes; outside the box the value of the nearest face holds. Parameters are a tuple of
-    arrays (x, y, z, 4), coarsest first; the colour is not squashed.
+    Trilinear between nodes; outside the box the value of the nearest face holds. The direction does not
+    matter, and the colour is not squashed.
+
+    Args:
+        config: The box and its resolution.
+
+    Returns:
+        The scene. Its parameters are a tuple of arrays (x, y, z, 4), the coarsest level first: signed
+        distance, red, green, blue.
+
+    >>> scene = grid(GridConfig(voxel=0.25, levels=1))
+    >>> distance, rgb = scene.query(scene.init(jax.random.key(0)), jnp.zeros(3), jnp.ones(3))
+    >>> print(f"{distance:.2f}", rgb)  # nothing is known yet: free space, grey
+    0.12 [0.5 0.5 0.5]
     """
     lower = np.asarray(config.lower, np.float32)
     coarse_cells = _coarse_cells(config)
@@ -70,10 +83,27 @@ def grid(config: GridConfig) -> SceneField:
 def bounding_grid(
     points: np.ndarray, *, voxel: float | None = None, levels: int = 2, nodes: int = 4_000_000
 ) -> GridConfig:
-    """A grid around world points (n, 3) [m], a quarter of its size wider on every side.
+    """A grid around world points, wider on every side by a quarter of their extent and 0.2 m.
 
-    It has about `nodes` nodes, or as many as `voxel` [m] asks for.
+    Args:
+        points: World points (n, 3) [m].
+        voxel: Side of a voxel [m] of the finest level; None: what gives about `nodes` nodes.
+        levels: How many nested levels.
+        nodes: How many nodes the finest level has, where `voxel` does not say.
+
+    Returns:
+        The grid's settings.
+
+    Raises:
+        ValueError: For no points, points of another shape, and points that are not finite.
+
+    >>> bounding_grid(np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]), voxel=0.1, levels=1).lower
+    (-0.5, -0.5, -0.5)
     """
+    check_shapes(points=(points, "n 3"))
+    check_finite(points=points)
+    if len(points) == 0:
+        raise ValueError("points: expected at least one, got none")
     lower, upper = points.min(axis=0), points.max(axis=0)
     margin = 0.25 * (upper - lower) + 0.2
     lower, upper = lower - margin, upper + margin
@@ -86,10 +116,16 @@ def bounding_grid(
 
 
 def grow(config: GridConfig, state: Any, points: np.ndarray) -> tuple[GridConfig, Any]:
-    """The grid enlarged to hold more world points (n, 3) [m], nodes where they were, new space free.
+    """The grid enlarged to hold more world points, its nodes where they were, the new space free.
 
-    `state` is any pytree that holds the parameters under the attribute `params` and arrays shaped like them,
-    (x, y, z, c), elsewhere: moments of an optimiser, say, which are zero in the new space.
+    Args:
+        config: The grid.
+        state: Any pytree that holds the parameters under the attribute `params` and arrays shaped like them,
+            (x, y, z, c), elsewhere: an optimiser's moments, say, which are zero in the new space.
+        points: World points (n, 3) [m].
+
+    Returns:
+        The larger grid, and the state on it.
     """
     cell = config.voxel * RATIO ** (config.levels - 1)
     lower, upper = np.array(config.lower), np.array(config.upper)
@@ -110,12 +146,29 @@ def grow(config: GridConfig, state: Any, points: np.ndarray) -> tuple[GridConfig
 
 
 def node_shape(config: GridConfig) -> Int[np.ndarray, "3"]:
-    """How many nodes the finest level has along x, y and z."""
+    """How many nodes the finest level has along x, y and z.
+
+    Args:
+        config: The grid.
+
+    Returns:
+        Three whole numbers.
+
+    >>> node_shape(GridConfig(voxel=0.25, levels=1)).tolist()
+    [9, 9, 9]
+    """
     return _coarse_cells(config) * RATIO ** (config.levels - 1) + 1
 
 
 def node_positions(config: GridConfig) -> Float[np.ndarray, "x y z 3"]:
-    """World positions [m] of the nodes of the finest level."""
+    """World positions of the nodes of the finest level.
+
+    Args:
+        config: The grid.
+
+    Returns:
+        Positions [m], float32.
+    """
     shape = node_shape(config)
     axes = [low + config.voxel * np.arange(n) for low, n in zip(config.lower, shape, strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).astype(np.float32)
@@ -125,6 +178,12 @@ def merge(params: Params) -> Params:
     """The same scene with all levels summed into the finest one: cheaper to query, and equal everywhere.
 
     Equal because the cells are nested: a trilinear function of a coarse cell is so in each cell within.
+
+    Args:
+        params: Parameters of a `grid`.
+
+    Returns:
+        Parameters of the same grid, of one level.
     """
     total = params[0]
     for level in params[1:]:
@@ -157,9 +216,19 @@ def _refine(values: Float[Array, "x y z c"], axis: int) -> Float[Array, "_ _ _ c
 
 
 def trilinear(values: Real[Array, "x y z c"], position: Float[Array, "3"]) -> Float[Array, " c"]:
-    """Value at a position in cells, outside that of the nearest face.
+    """Trilinear interpolation of nodes; outside, the value of the nearest face.
 
     Four rows of two nodes: on a CPU the fastest of the ways tried.
+
+    Args:
+        values: Values of the nodes.
+        position: Where to interpolate, in cells from the first node.
+
+    Returns:
+        The values there.
+
+    >>> trilinear(jnp.arange(8.0).reshape(2, 2, 2, 1), jnp.array([0.5, 0.0, 1.0])).tolist()
+    [3.0]
     """
     nodes = values.shape[:3]
     channels = values.shape[3]

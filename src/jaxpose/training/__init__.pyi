@@ -8,8 +8,9 @@ from .photometric import TrainConfig as TrainConfig
 from .photometric import Viewer as Viewer
 from .photometric import Views as Views
 from .photometric import viewer as viewer
-from .steps import Rate as Rate
+from .steps import Decay as Decay
 from .steps import State as State
 from .steps import Trainer as Trainer
+from .steps import adam as adam
 from .steps import joint as joint
 from .steps import microbatched_sum as microbatched_sum

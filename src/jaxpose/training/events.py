@@ -1,23 +1,25 @@
-"""A radiance field and a trajectory optimised together from events (the paper's section 4.2, PEERS B4).
+"""A radiance field and a trajectory optimised together from events (Ma et al. 2024, section 4.2).
 
 What is compared is the change of a pixel's log intensity between two instants: rendered, and reported by its
-events. `window` takes all pixels between the same two instants (EventNeRF); `asynchronous` takes pairs of
-events of one pixel, each rendered from the pose at its own time.
+events. `window` takes all pixels between the same two instants (EventNeRF, Rudnev et al. 2023);
+`asynchronous` takes pairs of events of one pixel, each rendered from the pose at its own time.
 """
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from jaxpose.events import PixelIndex, change_residual, cumulative_polarity
 from jaxpose.fields import PoseField
 from jaxpose.geometry.camera import Camera
+from jaxpose.render import pixel_ray
 from jaxpose.scenes import SceneField
-from jaxpose.training.photometric import Depths, draw_depths, pixel_ray, ray_colour
+from jaxpose.training.photometric import Depths, draw_depths, ray_colour
 from jaxpose.training.steps import Trainer, joint, microbatched_sum
 
 Loss = Literal["window", "asynchronous"]
@@ -72,14 +74,24 @@ def trainer(
     camera: Camera,
     depths: Depths,
     span: tuple[float, float],
-    scene_rates: Any,
-    pose_rates: Any,
+    optimizer: optax.GradientTransformation,
     config: EventTrainConfig = EventTrainConfig(),  # noqa: B008 - frozen
 ) -> Trainer:
-    """Adam on the squared difference of rendered and reported changes, jointly over scene and poses.
+    """Minimise the squared difference of rendered and reported changes, jointly over scene and poses.
 
-    `field.pose` is camera-to-world, `span` the first and last instant [s] with events. The trainer's data are
-    `EventData`. Both instants of a pixel are sampled at the same depths, drawn anew in every step.
+    Both instants of a pixel are sampled at the same depths, drawn anew in every step.
+
+    Args:
+        scene: A scene whose geometry is a volume density.
+        field: Camera-to-world poses, asked at the instants that are compared.
+        camera: Intrinsics of the event camera.
+        depths: Where samples lie along the optical axis.
+        span: The first and the last instant [s] with events.
+        optimizer: As `joint` takes it.
+        config: How many steps, pixels and samples, the loss and its settings.
+
+    Returns:
+        A trainer whose data are `EventData`.
     """
 
     def error(scene_params, item):
@@ -101,20 +113,31 @@ def trainer(
             )
         else:
             T_now, T_before = poses(pairs.t_now), poses(pairs.t_before)
-        x, y = pairs.pixel % camera.width, pairs.pixel // camera.width
-        rays = [jax.vmap(partial(pixel_ray, camera))(T, x, y) for T in (T_now, T_before)]
+        pixel = jnp.stack([pairs.pixel % camera.width, pairs.pixel // camera.width], axis=-1)
+        pixel = pixel.astype(T_now.dtype)
+        rays = [jax.vmap(partial(pixel_ray, camera))(T, pixel) for T in (T_now, T_before)]
         depth = draw_depths(depth_key, depths, rays=config.events, samples=config.samples)
         change = config.threshold * pairs.change.astype(depth.dtype)
         mask = data.mask[pairs.pixel] * pairs.weight[:, None]
         return total(scene_params, (*rays, depth, change, mask)) / (3 * config.events)
 
-    return joint(loss, scene.init, field.init, scene_rates, pose_rates, config.steps)
+    return joint(loss, scene.init, field.init, optimizer, config.steps)
 
 
 def window_pairs(
     key: PRNGKeyArray, streams: PixelIndex, span: tuple[float, float], config: EventTrainConfig
 ) -> Compared:
-    """Pixels that have changed between two instants, the same for all, and some drawn from all pixels."""
+    """Pixels that have changed between two instants, the same for all, and some drawn from all pixels.
+
+    Args:
+        key: A random key.
+        streams: The events, by pixel.
+        span: The first and the last instant [s] with events.
+        config: How many pixels, how far apart the instants are, how many pixels are drawn from all.
+
+    Returns:
+        Pixels and instants to compare.
+    """
     end_key, length_key, changed_key, any_key = jax.random.split(key, 4)
     end, before = _instants(end_key, length_key, (), span, config)
     pixels = jnp.arange(len(streams.first))
@@ -139,6 +162,15 @@ def asynchronous_pairs(
 
     Between two events of a pixel the change is a whole number of thresholds; a pixel's first event has none
     to be compared with and counts nothing.
+
+    Args:
+        key: A random key.
+        streams: The events, by pixel.
+        span: The first and the last instant [s] with events.
+        config: How many pixels, how far apart the instants are, how many pixels are drawn from all.
+
+    Returns:
+        Pixels and instants to compare.
     """
     event_key, back_key, pixel_key, end_key, length_key = jax.random.split(key, 5)
     negatives = int(config.events * config.negatives)

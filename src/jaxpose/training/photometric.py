@@ -1,20 +1,19 @@
-"""A radiance field and camera poses optimised together from photographs (the paper's section 4.1, eq. 3)."""
+"""A radiance field and camera poses optimised together from photographs (Ma et al. 2024, section 4.1)."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt8
 
-from jaxpose import render
+from jaxpose import optim, render
 from jaxpose.fields import PoseField
 from jaxpose.geometry import se3
-from jaxpose.geometry.camera import Camera, unproject
-from jaxpose.render import Ray, Spacing
+from jaxpose.geometry.camera import Camera, pixel_grid
+from jaxpose.render import Ray, Spacing, pixel_ray
 from jaxpose.scenes import SceneField
 from jaxpose.training.steps import Trainer, joint, microbatched_sum
 
@@ -23,7 +22,7 @@ Params = Any
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """How long and on what; the defaults are BARF's on Blender (PEERS B1), the paper draws 4096 rays."""
+    """How long and on what; the defaults are BARF's on Blender (Lin et al. 2021)."""
 
     steps: int = 200_000
     rays: int = 1024  # random pixels of random images in a step
@@ -55,14 +54,23 @@ def trainer(
     field: PoseField,
     camera: Camera,
     depths: Depths,
-    scene_rates: Any,
-    pose_rates: Any,
+    optimizer: optax.GradientTransformation,
     config: TrainConfig = TrainConfig(),  # noqa: B008 - frozen
 ) -> Trainer:
-    """Adam on the mean squared colour error of random rays, jointly over scene and poses.
+    """Minimise the mean squared colour error of random rays, jointly over scene and poses (BARF).
 
-    `field.pose` is camera-to-world; `scene` has a volume density; the rates are as in `train.joint`. Samples
-    are drawn anew for every ray. Rays that end nowhere are as in BARF: the last sample closes them.
+    Samples are drawn anew for every ray. A ray that ends nowhere is closed by its last sample, as in BARF.
+
+    Args:
+        scene: A scene whose geometry is a volume density.
+        field: Camera-to-world poses, asked at the times of the views.
+        camera: Intrinsics of all views.
+        depths: Where samples lie along the optical axis.
+        optimizer: As `joint` takes it.
+        config: How many steps, rays and samples.
+
+    Returns:
+        A trainer whose data are `Views`.
     """
 
     def error(scene_params, item):
@@ -75,27 +83,48 @@ def trainer(
         view_key, pixel_key, depth_key = jax.random.split(key, 3)
         count, height, width, _ = views.rgb.shape
         view = jax.random.randint(view_key, (config.rays,), 0, count)
-        x, y = _pixels(pixel_key, config.rays, height, width)
+        pixel = _pixels(pixel_key, config.rays, height, width)
         # Once for every image, not for every ray.
         T_world_cam = jax.vmap(field.pose, (None, 0))(pose_params, views.t)[view]
-        rays = jax.vmap(partial(pixel_ray, camera))(T_world_cam, x, y)
+        rays = jax.vmap(partial(pixel_ray, camera))(T_world_cam, pixel.astype(T_world_cam.dtype))
         batch = (
             rays,
             draw_depths(depth_key, depths, rays=config.rays, samples=config.samples),
-            _unit(views.rgb[view, y, x]),
+            _unit(views.rgb[view, pixel[:, 1], pixel[:, 0]]),
         )
         return total(scene_params, batch) / (3 * config.rays)
 
-    return joint(loss, scene.init, field.init, scene_rates, pose_rates, config.steps)
+    return joint(loss, scene.init, field.init, optimizer, config.steps)
+
+
+@runtime_checkable
+class RenderImage(Protocol):
+    """Colour in [0, 1] and z-depth [scene units] of all pixels of one camera, from a camera-to-world pose."""
+
+    def __call__(
+        self, scene_params: Params, T_world_cam: Float[Array, "4 4"], /
+    ) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"]]: ...
+
+
+@runtime_checkable
+class RefinePose(Protocol):
+    """A camera-to-world pose moved, by a twist of the world, to where the scene explains an image."""
+
+    def __call__(
+        self,
+        scene_params: Params,
+        T_world_cam: Float[Array, "4 4"],
+        rgb: UInt8[Array, "h w 3"],
+        key: PRNGKeyArray,
+        /,
+    ) -> Float[Array, "4 4"]: ...
 
 
 class Viewer(NamedTuple):
     """Compiled functions that look at a trained scene from any pose of one camera."""
 
-    # Colour in [0, 1] and z-depth [scene units] of all pixels.
-    image: Callable[[Params, Float[Array, "4 4"]], tuple[Float[Array, "h w 3"], Float[Array, "h w"]]]
-    # Camera-to-world pose moved, by turns and shifts of the world, to where the scene explains an image.
-    settle: Callable[[Params, Float[Array, "4 4"], UInt8[Array, "h w 3"], PRNGKeyArray], Float[Array, "4 4"]]
+    image: RenderImage
+    refine_pose: RefinePose
 
 
 def viewer(
@@ -105,55 +134,59 @@ def viewer(
     config: TrainConfig = TrainConfig(),  # noqa: B008 - frozen
     *,
     background: float | None = None,
-    settle_steps: int = 100,
-    settle_rate: float = 1e-3,
+    refine_steps: int = 100,
+    refine_optimizer: optax.GradientTransformation = optax.adam(1e-3),  # noqa: B008 - functions
 ) -> Viewer:
-    """`image` samples the middles of equal parts; `settle` is BARF's test-time optimisation of one pose.
+    """Functions that render a trained scene, and refine the pose of an image it was not trained on.
 
-    That is Adam at a constant rate on a twist, the scene at rest, `config.rays` random pixels a step.
+    `image` samples the middles of equal parts of each ray. `refine_pose` is BARF's test-time optimisation of
+    one pose, the scene at rest, on `config.rays` random pixels a step.
+
+    Args:
+        scene: A scene whose geometry is a volume density.
+        camera: Intrinsics of the images.
+        depths: Where samples lie along the optical axis.
+        config: How many rays and samples.
+        background: Known colour behind the scene in [0, 1], as `ray_colour` takes it.
+        refine_steps: How many steps `refine_pose` takes.
+        refine_optimizer: Any optax transformation of a twist (6,).
+
+    Returns:
+        The two functions.
     """
-    adam = optax.adam(settle_rate)
+
+    colour = lambda params, ray, depth: ray_colour(scene, params, ray, depth, background)
 
     def image(scene_params, T_world_cam):
-        y, x = jnp.mgrid[: camera.height, : camera.width]
+        pixels = jnp.asarray(pixel_grid(camera), T_world_cam.dtype)
         depth = render.sample_depths(None, depths.near, depths.far, config.samples, spacing=depths.spacing)
-        one = lambda xy: ray_colour(
-            scene, scene_params, pixel_ray(camera, T_world_cam, *xy), depth, background
-        )
-        rgb, found = jax.lax.map(one, (x.ravel(), y.ravel()), batch_size=config.chunk)
-        return rgb.reshape(*x.shape, 3), found.reshape(x.shape)
+        one = lambda pixel: colour(scene_params, pixel_ray(camera, T_world_cam, pixel), depth)
+        rgb, found = jax.lax.map(one, pixels.reshape(-1, 2), batch_size=config.chunk)
+        return rgb.reshape(pixels.shape[0], -1, 3), found.reshape(pixels.shape[:2])
 
-    def settle(scene_params, T_world_cam, rgb, key):
+    def refine_pose(scene_params, T_world_cam, rgb, key):
         def error(_, item):
             ray, depth, seen = item
-            return jnp.sum((ray_colour(scene, scene_params, ray, depth, background)[0] - seen) ** 2)
+            return jnp.sum((colour(scene_params, ray, depth)[0] - seen) ** 2)
 
         total = microbatched_sum(error, min(config.chunk, config.rays))
 
-        def loss(twist, key):
-            pixel_key, depth_key = jax.random.split(key)
-            x, y = _pixels(pixel_key, config.rays, *rgb.shape[:2])
+        def loss(twist, step):
+            pixel_key, depth_key = jax.random.split(jax.random.fold_in(key, step))
+            pixel = _pixels(pixel_key, config.rays, *rgb.shape[:2])
             moved = se3.compose(se3.exp(twist), T_world_cam)
-            rays = jax.vmap(partial(pixel_ray, camera, moved))(x, y)
             batch = (
-                rays,
+                jax.vmap(partial(pixel_ray, camera, moved))(pixel.astype(moved.dtype)),
                 draw_depths(depth_key, depths, rays=config.rays, samples=config.samples),
-                _unit(rgb[y, x]),
+                _unit(rgb[pixel[:, 1], pixel[:, 0]]),
             )
             return total((), batch) / (3 * config.rays)
 
-        def step(carry, key):
-            twist, memory = carry
-            with jax.numpy_dtype_promotion("standard"):  # optax needs it
-                move, memory = adam.update(jax.grad(loss)(twist, key), memory)
-            return (twist + move, memory), None
-
-        twist = jnp.zeros(6, T_world_cam.dtype)
-        keys = jax.random.split(key, settle_steps)
-        (twist, _), _ = jax.lax.scan(step, (twist, adam.init(twist)), keys)
+        still = jnp.zeros(6, T_world_cam.dtype)
+        twist = optim.minimize(loss, still, refine_optimizer, refine_steps).params
         return se3.compose(se3.exp(twist), T_world_cam)
 
-    return Viewer(jax.jit(image), jax.jit(settle))
+    return Viewer(jax.jit(image), jax.jit(refine_pose))
 
 
 def ray_colour(
@@ -163,10 +196,20 @@ def ray_colour(
     depth: Float[Array, " s"],
     background: float | None = None,
 ) -> tuple[Float[Array, "3"], Float[Array, ""]]:
-    """Colour and expected depth along one ray whose direction has length 1 along the optical axis.
+    """Colour and expected depth along one ray through a scene with a volume density.
 
     Without a `background` the last sample closes the ray, as in BARF; with one, what passes the last sample
     but one shows it, and the depth is that of the rest.
+
+    Args:
+        scene: The scene, and
+        scene_params: its parameters.
+        ray: A ray whose direction has length 1 along the optical axis, as `pixel_ray` gives it.
+        depth: Increasing depths of the samples along the optical axis [scene units].
+        background: Colour behind the scene in [0, 1]; None: there is none.
+
+    Returns:
+        Colour in [0, 1] and expected z-depth [scene units].
     """
 
     def weights(density, depth):
@@ -180,25 +223,26 @@ def ray_colour(
     return rendered.opacity * rendered.rgb + (1 - rendered.opacity) * background, rendered.depth
 
 
-def pixel_ray(camera: Camera, T_world_cam: Float[Array, "4 4"], x: Int[Array, ""], y: Int[Array, ""]) -> Ray:
-    """The ray through a pixel, its direction of length 1 along the optical axis."""
-    pixel = jnp.stack([x, y]).astype(T_world_cam.dtype)
-    direction = jnp.matmul(T_world_cam[:3, :3], unproject(camera, pixel), precision="highest")
-    return Ray(T_world_cam[:3, 3], direction)
-
-
-def _pixels(
-    key: PRNGKeyArray, count: int, height: int, width: int
-) -> tuple[Int[Array, " count"], Int[Array, " count"]]:
+def _pixels(key: PRNGKeyArray, count: int, height: int, width: int) -> Int[Array, "{count} 2"]:
     """Columns and rows, any as likely as any other."""
     pixel = jax.random.randint(key, (count,), 0, height * width)
-    return pixel % width, pixel // width
+    return jnp.stack([pixel % width, pixel // width], axis=-1)
 
 
 def draw_depths(
     key: PRNGKeyArray, depths: Depths, *, rays: int, samples: int
 ) -> Float[Array, "rays samples"]:
-    """Increasing depths for each of so many rays, drawn as `render.sample_depths` does."""
+    """Increasing depths for each of many rays, drawn as `render.sample_depths` does.
+
+    Args:
+        key: A random key.
+        depths: The range [scene units], and what is equally spaced in it.
+        rays: How many rays.
+        samples: How many depths of each.
+
+    Returns:
+        Depths along the optical axis [scene units].
+    """
     draw = lambda key: render.sample_depths(key, depths.near, depths.far, samples, spacing=depths.spacing)
     return jax.vmap(draw)(jax.random.split(key, rays))
 

@@ -1,81 +1,148 @@
 """Joint training of a scene and a pose field, and sums over many items in the memory of a few."""
 
+import math
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
+from jaxpose import optim
 from jaxpose.fields import set_progress
 
-Params = Any
-Batch = Any
+Params: TypeAlias = Any
+Batch: TypeAlias = Any
+Init: TypeAlias = Callable[[PRNGKeyArray], Params]
 
 
-class Rate(NamedTuple):
-    """Adam's learning rate over the training: exponential from `first` to `last`, zero before `start`.
+@runtime_checkable
+class JointLoss(Protocol):
+    """The loss of one step: `loss(scene_params, pose_params, data, key)`, a scalar."""
 
-    `start` is a share of the training. All three may be arrays that broadcast against the parameters.
-    """
-
-    first: Any
-    last: Any
-    start: Any = 0.0
+    def __call__(
+        self, scene_params: Params, pose_params: Params, data: Batch, key: PRNGKeyArray, /
+    ) -> Float[Array, ""]: ...
 
 
 class State(NamedTuple):
-    """All that a training goes on from."""
+    """State of a training between two steps. A checkpoint stores exactly this."""
 
     scene: Params
     pose: Params
-    adam: Any
+    opt_state: Any
     key: PRNGKeyArray
-    step: Int[Array, ""]
+    step: Int[Array, ""]  # how many are done
 
 
 class Trainer(NamedTuple):
-    """Compiled functions of one training."""
+    """Compiled functions of one training.
+
+    `start(key)` is the state before the first step; `advance(state, data, count)` takes `count` (static)
+    steps on the data and returns the new state and the loss of each step.
+    """
 
     start: Callable[[PRNGKeyArray], State]
-    # Some steps (static) on the data, and the loss of each.
     advance: Callable[[State, Batch, int], tuple[State, Float[Array, " k"]]]
 
 
-def joint(
-    loss: Callable[[Params, Params, Batch, PRNGKeyArray], Float[Array, ""]],
-    init_scene: Callable[[PRNGKeyArray], Params],
-    init_pose: Callable[[PRNGKeyArray], Params],
-    scene_rates: Any,
-    pose_rates: Any,
-    steps: int,
-) -> Trainer:
-    """Adam on `loss(scene, pose, data, key)`, jointly over the parameters of scene and poses.
+class Decay(NamedTuple):
+    """A learning rate over a training: exponential from `first` to `last`, 0 before the share `start` of it.
 
-    The rates are trees of `Rate`, each a prefix of its parameters. Coarse-to-fine windows of scene and field
-    follow the steps.
+    >>> rate = Decay(1e-2, 1e-4, start=0.25).schedule(100)
+    >>> print(*(f"{rate(step):.6f}" for step in (0, 24, 25, 50, 100)))
+    0.000000 0.000000 0.003162 0.001000 0.000100
     """
-    adam = optax.scale_by_adam()
+
+    first: float
+    last: float
+    start: float = 0.0
+
+    def schedule(self, steps: int) -> optax.Schedule:
+        """The rate as an optax schedule, for a training of so many steps.
+
+        Raises:
+            ValueError: For rates that are not positive, and a start outside [0, 1].
+        """
+        if min(self.first, self.last) <= 0 or not 0 <= self.start <= 1:
+            raise ValueError(f"Decay: expected first, last > 0 and start in [0, 1], got {tuple(self)}")
+        waits = math.ceil(self.start * steps - 1e-6)
+        decay = optax.exponential_decay(self.first, steps, self.last / self.first)
+        if waits == 0:
+            return decay
+        return optax.join_schedules([optax.constant_schedule(0.0), lambda step: decay(step + waits)], [waits])
+
+
+def adam(rates: Any, steps: int) -> optax.GradientTransformation:
+    """Adam with a rate for each part of the parameters, as BARF and Ma et al. 2024 train.
+
+    Args:
+        rates: A prefix of `{"scene": scene_params, "pose": pose_params}` whose leaves are `Decay`s, optax
+            schedules, or numbers; 0 keeps a part as it is.
+        steps: The length of the training.
+
+    Returns:
+        An optimizer for `joint`, and any other pytree that `rates` is a prefix of.
+
+    >>> optimizer = adam({"scene": Decay(1e-3, 1e-4), "pose": 0.0}, 100)
+    >>> params = {"scene": jnp.ones(()), "pose": jnp.ones(())}
+    >>> optim.apply(optimizer, params, params, optimizer.init(params))[0]
+    {'pose': Array(1., dtype=float32), 'scene': Array(0.999, dtype=float32)}
+    """
+    is_decay = lambda rate: isinstance(rate, Decay)
+    rates = jax.tree.map(
+        lambda rate: rate.schedule(steps) if is_decay(rate) else rate, rates, is_leaf=is_decay
+    )
+    return optax.chain(optax.scale_by_adam(), optim.scale_by_rates(rates))
+
+
+def joint(
+    loss: JointLoss, init_scene: Init, init_pose: Init, optimizer: optax.GradientTransformation, steps: int
+) -> Trainer:
+    """Optimise a loss jointly over the parameters of a scene and of poses (Ma et al. 2024, eq. 3).
+
+    Coarse-to-fine windows of scene and field (`progress` among their parameters) follow the steps.
+
+    Args:
+        loss: `loss(scene_params, pose_params, data, key)`, a scalar; `key` is another in every step.
+        init_scene: `init_scene(key)`, the scene's parameters at the start.
+        init_pose: Likewise the pose field's.
+        optimizer: Any optax transformation of `{"scene": scene_params, "pose": pose_params}`. Parts get
+            optimizers of their own by `optax.partition`; `adam` gives them rates of their own.
+        steps: The length of the training, to which the windows refer.
+
+    Returns:
+        The compiled steps; scene and poses of their state are `state.scene` and `state.pose`.
+
+    Raises:
+        ValueError: For `steps` below 1.
+
+    >>> loss = lambda scene, pose, data, key: jnp.sum((scene + pose - data) ** 2)
+    >>> zero = lambda key: jnp.zeros(())
+    >>> parts = {"scene": optax.sgd(0.1), "pose": optax.set_to_zero()}
+    >>> trainer = joint(loss, zero, zero, optax.partition(parts, {"scene": "scene", "pose": "pose"}), 50)
+    >>> state, losses = trainer.advance(trainer.start(jax.random.key(0)), jnp.float32(3), 50)
+    >>> print(f"{state.scene:.3f} {state.pose:.3f} {losses[0]:.3f} {losses[-1]:.3f}")
+    3.000 0.000 9.000 0.000
+    """
+    if steps < 1:
+        raise ValueError(f"steps: expected at least 1, got {steps}")
 
     def start(key):
         scene_key, pose_key, key = jax.random.split(key, 3)
-        first = init_scene(scene_key), init_pose(pose_key)
-        return State(*first, adam.init(first), key, jnp.zeros((), jnp.int32))
+        params = {"scene": init_scene(scene_key), "pose": init_pose(pose_key)}
+        return State(**params, opt_state=optimizer.init(params), key=key, step=jnp.zeros((), jnp.int32))
 
     def step(state, _, data):
         key, loss_key = jax.random.split(state.key)
         progress = state.step.astype(jnp.zeros(()).dtype) / steps
-        params = _at(state.scene, progress), _at(state.pose, progress)
-        value, gradient = jax.value_and_grad(lambda both: loss(both[0], both[1], data, loss_key))(params)
-        with jax.numpy_dtype_promotion("standard"):  # optax needs it
-            direction, memory = adam.update(gradient, state.adam)
-        rates = scene_rates, pose_rates
-        moves = jax.tree.map(lambda rate: _rate(rate, progress), rates, is_leaf=_is_rate)
-        moves = jax.tree.broadcast(moves, params)
-        scene_params, pose_params = jax.tree.map(lambda p, rate, d: p - rate * d, params, moves, direction)
-        return State(scene_params, pose_params, memory, key, state.step + 1), value
+        params = {"scene": _at(state.scene, progress), "pose": _at(state.pose, progress)}
+        of_params = lambda params: loss(params["scene"], params["pose"], data, loss_key)
+        value, gradient = jax.value_and_grad(of_params)(params)
+        params, opt_state = optim.apply(optimizer, params, gradient, state.opt_state)
+        return State(**params, opt_state=opt_state, key=key, step=state.step + 1), value
 
     def advance(state, data, count):
         return jax.lax.scan(partial(step, data=data), state, length=count)
@@ -86,14 +153,27 @@ def joint(
 def microbatched_sum(
     loss: Callable[[Params, Any], Float[Array, ""]], chunk: int
 ) -> Callable[[Params, Batch], Float[Array, ""]]:
-    """`total(params, batch)`: the sum of `loss(params, item)` over the items of `batch`, `chunk` at a time.
+    """The sum of a loss over many items, computed `chunk` items at a time: for reverse mode only.
 
-    `batch` is a pytree whose arrays share their leading axis; `item` is one entry of it (the chunks are
-    vmapped here). Gradients reach `params` and `batch`, so that rays, say, may depend on poses that are
-    trained too. They are computed together with the value, one chunk after the other, and the way back only
-    scales them: what is stored is never more than one chunk's intermediate values, which stay in the cache.
-    Whole numbers and random keys in `batch` get no gradient, nor does anything else that `loss` refers to:
-    what is differentiated must come in by the two arguments. For reverse mode only.
+    Gradients reach `params` and `batch`, so that rays, say, may depend on poses that are trained too. They
+    are computed with the value, one chunk after the other, and the backward pass only scales them: what is
+    stored is never more than one chunk's intermediate values. Whole numbers and random keys in `batch` get no
+    gradient, nor does anything else that `loss` refers to: it must come in by the two arguments.
+
+    Args:
+        loss: `loss(params, item)`, a scalar, of one item.
+        chunk: How many items are computed at a time, vmapped.
+
+    Returns:
+        `total(params, batch)`; `batch` is a pytree whose arrays share their leading axis, that of items.
+
+    Raises:
+        ValueError: For `chunk` below 1.
+
+    >>> total = microbatched_sum(lambda params, item: params * item**2, chunk=2)
+    >>> value, gradient = jax.value_and_grad(total)(jnp.float32(3), jnp.arange(5.0))
+    >>> print(value, gradient)
+    90.0 30.0
     """
     if chunk < 1:
         raise ValueError(f"chunk: expected at least 1 item, got {chunk}")
@@ -164,13 +244,3 @@ def _at(params: Params, progress: Float[Array, ""]) -> Params:
     """Parameters whose coarse-to-fine window, if they have one, is where the training is."""
     has_window = isinstance(params, dict) and "progress" in params
     return set_progress(params, progress) if has_window else params
-
-
-def _is_rate(x: Any) -> bool:
-    return isinstance(x, Rate)
-
-
-def _rate(rate: Rate, progress: Float[Array, ""]) -> Float[Array, "*n"]:
-    first, last, start = (jnp.asarray(x, progress.dtype) for x in rate)
-    # Not first (last / first)^progress: a rate of zero keeps its parameters at rest.
-    return jnp.where(progress >= start, first ** (1 - progress) * last**progress, 0)

@@ -1,6 +1,5 @@
 """Any recording of events: which of the layouts a folder or file has, told by its files, and its loader."""
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Literal, NamedTuple, Protocol, get_args
 
@@ -20,9 +19,20 @@ Format = Literal["eventnerf", "davis", "hdf5", "npz"]
 class _Module(Protocol):
     """What the module of a layout has."""
 
-    detect: Callable[[Path], bool]
-    find: Callable[..., Source]
-    load: Callable[..., EventRecording]
+    def detect(self, path: Path, /) -> bool: ...
+
+    def find(self, path: Path | str, /, *, size: tuple[int, int] | None = None) -> Source: ...
+
+    def load(
+        self,
+        path: Path | str,
+        /,
+        *,
+        mosaic: Mosaic,
+        size: tuple[int, int] | None = None,
+        unit: Unit | None = None,
+        span: tuple[float, float] | None = None,
+    ) -> EventRecording: ...
 
 
 class _Layout(NamedTuple):

@@ -1,6 +1,5 @@
 """How good a training on events is: pose errors over the motion, held-out views after a correction."""
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -23,7 +22,7 @@ from jaxpose.fields import piecewise_geodesic, set_progress
 from jaxpose.geometry.rigid import Similarity, vector_angle
 from jaxpose.plots.nerf import HeldOut
 from jaxpose.training import photometric
-from jaxpose.training.photometric import TrainConfig
+from jaxpose.training.photometric import RenderImage, TrainConfig
 from jaxpose.training.steps import State
 
 _MOST_POSES = 200  # at which errors are measured
@@ -149,7 +148,7 @@ def corrected(
 
 
 def _seen(
-    image: Callable[..., Any],
+    image: RenderImage,
     scene: Any,
     photographs: Photographs,
     poses: Float[np.ndarray, "n 4 4"],
@@ -181,7 +180,7 @@ def _displacement(
     state: State,
     scene: Any,
     ground_truth: GroundTruth | None,
-    image: Callable[..., Any],
+    image: RenderImage,
 ) -> dict[str, Any]:
     """The direction of a short motion against ground truth's, and contrasts along multiples of the motion.
 

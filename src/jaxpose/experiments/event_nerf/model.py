@@ -14,33 +14,33 @@ from jaxpose.fields import PoseField, PoseNetConfig
 from jaxpose.scenes import NerfConfig, SceneField, nerf
 from jaxpose.training import events as event_training
 from jaxpose.training.events import EventData, EventTrainConfig
-from jaxpose.training.steps import Rate, Trainer
+from jaxpose.training.steps import Decay, Trainer, adam
 
 _FAST = EventTrainConfig(steps=3000, events=512, samples=32, chunk=32)
 _PAPER = EventTrainConfig(steps=200_000, events=1024, samples=192, chunk=16)
 _SMOKE = EventTrainConfig(steps=CHUNK, events=32, samples=8, chunk=32)
 _SMOKE_SCENE = NerfConfig(layers=2, width=16, skip=None, colour_width=8, octaves=4, window=(0.1, 0.5))
-_FAST_SCENE = NerfConfig(layers=4, width=96, skip=2, colour_width=48, octaves=7, quiet=True)
+_FAST_SCENE = NerfConfig(layers=4, width=96, skip=2, colour_width=48, octaves=7, zero_bands=True)
 
 
 class Preset(NamedTuple):
     """A scene, and Adam's first and last rate and its start for the poses, by what is wrong with them."""
 
     scene: NerfConfig
-    translation: Rate
-    rotation: Rate
+    translation: Decay
+    rotation: Decay
 
 
-_PAPER_PRESET = Preset(NerfConfig(), Rate(2e-4, 2e-6), Rate(5e-5, 5e-7))
+_PAPER_PRESET = Preset(NerfConfig(), Decay(2e-4, 2e-6), Decay(5e-5, 5e-7))
 _FAST_PRESETS = {
     # Orientations are known: a turn that came as fast as a shift would be taken for one. The scene stays
     # blurred until the cameras are where it is seen.
     "positions": Preset(
-        replace(_FAST_SCENE, window=(0.2, 0.7)), Rate(3e-3, 1e-4, 0.03), Rate(1e-6, 1e-7, 0.06)
+        replace(_FAST_SCENE, window=(0.2, 0.7)), Decay(3e-3, 1e-4, 0.03), Decay(1e-6, 1e-7, 0.06)
     ),
-    "axis": Preset(replace(_FAST_SCENE, window=(0.1, 0.5)), Rate(1e-3, 3e-5, 0.03), Rate(3e-5, 2e-6, 0.06)),
+    "axis": Preset(replace(_FAST_SCENE, window=(0.1, 0.5)), Decay(1e-3, 3e-5, 0.03), Decay(3e-5, 2e-6, 0.06)),
     # A short slide is a small angle: turns of its size must come as slowly as it, after the scene.
-    "all": Preset(replace(_FAST_SCENE, window=(0.1, 0.5)), Rate(3e-4, 2e-5, 0.3), Rate(1e-6, 1e-7, 0.3)),
+    "all": Preset(replace(_FAST_SCENE, window=(0.1, 0.5)), Decay(3e-4, 2e-5, 0.3), Decay(1e-6, 1e-7, 0.3)),
 }
 
 
@@ -49,7 +49,7 @@ class Model(NamedTuple):
 
     scene: SceneField
     field: PoseField
-    rates: dict[str, Rate]  # of the scene and, where it moves, of the parts of the pose field
+    rates: dict[str, Decay]  # of the scene and, where it moves, of the parts of the pose field
     train: EventTrainConfig
     trainer: Trainer
     data: EventData
@@ -75,9 +75,11 @@ def build(config: Config, problem: Problem) -> Model:
         background=problem.background,
     )
     field, pose_rates = _field(config, problem, plan)
-    scene_rate = Rate(5e-4, 5e-4) if paper else Rate(1e-3, 1e-4)
+    scene_rate = Decay(5e-4, 5e-4) if paper else Decay(1e-3, 1e-4)
+    window = {} if config.pose == "linear" or config.net.window is None else {"progress": 0.0}
+    optimizer = adam({"scene": scene_rate, "pose": pose_rates | window}, train.steps)
     trainer = event_training.trainer(
-        scene, field, recording.camera, problem.depths, span, scene_rate, pose_rates, train
+        scene, field, recording.camera, problem.depths, span, optimizer, train
     )  # fmt: skip
     return Model(
         scene,
@@ -98,7 +100,7 @@ def describe(config: Config, model: Model) -> dict[str, Any]:
         "preset": config.preset,
         **train,
         "net": asdict(config.net) if config.pose == "posenet" else None,
-        "rates": {"first_last_start": {name: list(rate) for name, rate in model.rates.items()}},
+        "rates": {name: rate._asdict() for name, rate in model.rates.items()},
     }
 
 
@@ -108,7 +110,7 @@ def _preset(config: Config, problem: Problem) -> Preset:
     return _FAST_PRESETS["all" if problem.slides else "axis" if config.axis_offset_deg else "positions"]
 
 
-def _field(config: Config, problem: Problem, plan: Preset) -> tuple[PoseField, dict[str, Rate]]:
+def _field(config: Config, problem: Problem, plan: Preset) -> tuple[PoseField, dict[str, Decay]]:
     """The trajectory as a field, and the rates of its parameters."""
     initial = fields.piecewise_geodesic(*(jnp.asarray(x, jnp.float32) for x in problem.start))
     if config.pose == "linear":
@@ -118,8 +120,6 @@ def _field(config: Config, problem: Problem, plan: Preset) -> tuple[PoseField, d
     rates = {"translation": plan.translation, "rotation": plan.rotation}
     if config.net.coupled:
         rates = {"coupled": rates["rotation"]}
-    if config.net.window is not None:
-        rates = rates | {"progress": Rate(1.0, 1.0)}
     # On the camera's side a wrong axis is a constant, and a chord of the circle comes near and goes away.
     return fields.right_correction(fields.posenet(posenet), initial), rates
 

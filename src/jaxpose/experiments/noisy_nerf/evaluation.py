@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 from jaxtyping import Float, PRNGKeyArray
 
 from jaxpose.evaluation import trajectory_error
@@ -60,8 +61,8 @@ def measure(
         problem.train.camera,
         model.depths,
         model.train,
-        settle_steps=config.test_pose_steps,
-        settle_rate=model.settle_rate,
+        refine_steps=config.test_pose_steps,
+        refine_optimizer=optax.adam(model.refine_rate),
     )
     scene = set_progress(state.scene, jnp.ones(()))
     keys = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), 1), len(problem.held_out.t))
@@ -104,7 +105,7 @@ def _test_time_refined(
     key: PRNGKeyArray,
 ) -> dict[str, float | None]:
     rgb = jnp.asarray(problem.held_out.rgb[index])
-    moved = viewer.settle(scene, jnp.asarray(pose, jnp.float32), rgb, key)
+    moved = viewer.refine_pose(scene, jnp.asarray(pose, jnp.float32), rgb, key)
     return _seen(viewer, scene, problem, index, np.asarray(moved, np.float64))[0]
 
 

@@ -4,7 +4,6 @@ import warnings
 from dataclasses import asdict, replace
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -16,10 +15,10 @@ from jaxpose.experiments.training_loop import CHUNK
 from jaxpose.fields import PoseField, PoseNetConfig
 from jaxpose.scenes import NerfConfig, SceneField, nerf
 from jaxpose.training.photometric import Depths, TrainConfig, Views, trainer
-from jaxpose.training.steps import Rate, Trainer
+from jaxpose.training.steps import Decay, Trainer, adam
 
 _FAST_SCENE = NerfConfig(
-    layers=4, width=96, skip=2, colour_width=48, octaves=7, window=(0.15, 0.5), quiet=True
+    layers=4, width=96, skip=2, colour_width=48, octaves=7, window=(0.15, 0.5), zero_bands=True
 )
 _SMOKE_SCENE = NerfConfig(layers=2, width=16, skip=None, colour_width=8, octaves=4, window=(0.1, 0.5))
 _FAST = TrainConfig(steps=5000, rays=1024, samples=32, chunk=64)
@@ -40,7 +39,7 @@ _PER_FRAME_RATES = {  # also of splines; with preset paper BARF's
     "noisy": ((3e-3, 1e-4), (3e-3, 1e-4)),
     "unknown": ((2e-3, 1e-4), (6e-3, 3e-4)),
 }
-_BARF_SETTLE = {"depth": 1e-3, "disparity": 3e-3}  # BARF's rate of test-time poses, Blender and LLFF
+_BARF_REFINE = {"depth": 1e-3, "disparity": 3e-3}  # BARF's rate of test-time poses, Blender and LLFF
 
 
 class Model(NamedTuple):
@@ -48,13 +47,12 @@ class Model(NamedTuple):
 
     scene: SceneField
     field: PoseField
-    scene_rates: Rate
-    pose_rates: Any
+    rates: dict[str, Decay]  # of the scene, and of translation and rotation of the pose field
     train: TrainConfig
     depths: Depths
     views: Views
     trainer: Trainer
-    settle_rate: float
+    refine_rate: float  # of the test-time pose refinement
 
 
 def build(config: Config, problem: Problem) -> Model:
@@ -66,26 +64,23 @@ def build(config: Config, problem: Problem) -> Model:
     else:
         scene, train = (nerf(), _PAPER) if paper else (nerf(_fast_scene(config)), _FAST)
         train = replace(train, steps=config.steps or train.steps, rays=config.rays or train.rays)
-    if not paper:
-        scene_rates = Rate(1e-3, 1e-4)
-    else:
-        scene_rates = Rate(5e-4, 1e-4) if barf == "depth" else Rate(1e-3, 1e-4)
+    scene_rate = Decay(5e-4 if paper and barf == "depth" else 1e-3, 1e-4)
     t = jnp.asarray(photographs.t, jnp.float32)
-    correction, rates = _field(config, problem)
+    rates = _rates(config, problem)
+    optimizer = adam({"scene": scene_rate, "pose": _pose_rates(config, rates, train.steps)}, train.steps)
     start = fields.piecewise_geodesic(t, jnp.asarray(problem.T_start, jnp.float32))
     correct = fields.left_correction if config.side == "world" else fields.right_correction
-    field = correct(correction, start)
+    field = correct(_correction(config, problem), start)
     depths = Depths(photographs.near, photographs.far, photographs.spacing)
     return Model(
         scene,
         field,
-        scene_rates,
-        rates,
+        {"scene": scene_rate, **rates},
         train,
         depths,
         Views(t, jnp.asarray(photographs.rgb)),
-        trainer(scene, field, photographs.camera, depths, scene_rates, rates, train),
-        _BARF_SETTLE[barf],
+        trainer(scene, field, photographs.camera, depths, optimizer, train),
+        _BARF_REFINE[barf],
     )
 
 
@@ -113,11 +108,6 @@ def describe(config: Config, model: Model) -> dict[str, Any]:
     """The settings of a training, in words and numbers."""
     train = asdict(model.train)
     del train["chunk"]
-    plain = lambda rates: jax.tree.map(
-        lambda rate: [np.unique(part).tolist() for part in rate],
-        rates,
-        is_leaf=lambda x: isinstance(x, Rate),
-    )
     return {
         "pose": config.pose,
         "preset": config.preset,
@@ -126,38 +116,49 @@ def describe(config: Config, model: Model) -> dict[str, Any]:
         "net": asdict(config.net) if config.pose == "posenet" else None,
         "spline_knots": config.spline_knots if "spline" in config.pose else None,
         "spline_smoothing": config.spline_smoothing if config.pose == "spline_reset" else None,
-        "rates": {"first_last_start": {"scene": plain(model.scene_rates), "pose": plain(model.pose_rates)}},
+        "rates": {name: rate._asdict() for name, rate in model.rates.items()},
     }
 
 
-def _field(config: Config, problem: Problem) -> tuple[PoseField, Any]:
-    """The correction of the poses by itself, and its rates."""
-    photographs, paper = problem.train, config.preset == "paper"
+def _correction(config: Config, problem: Problem) -> PoseField:
+    """The correction of the poses by itself."""
+    photographs = problem.train
     span = (float(photographs.t[0]), float(photographs.t[-1]))
-    shift_from, turn_from = (0.0, 0.0) if paper else (_SHIFT_FROM, _TURN_FROM)
-    start = "unknown" if config.noise == "unknown" else "noisy"
     if config.pose == "posenet":
         # tanh bounds the translation: half the cameras' extent, or, where nothing is known of them, the
         # nearest depth, which is the unit of LLFF's scenes.
         scale = photographs.near if config.noise == "unknown" else problem.extent / 2
         net = replace(config.net, layers=2, width=32) if config.smoke else config.net
         posenet = PoseNetConfig(span=span, translation_scale=scale, **asdict(net))
+        return fields.posenet(posenet)
+    if config.pose == "bspline":
+        return fields.bspline(span, config.spline_knots)
+    return fields.per_frame_poses(photographs.t)
+
+
+def _rates(config: Config, problem: Problem) -> dict[str, Decay]:
+    """Rates of translation and rotation of the pose field."""
+    paper = config.preset == "paper"
+    start = "unknown" if config.noise == "unknown" else "noisy"
+    if config.pose == "posenet":
         shift, turn = _NET_RATES["paper" if paper else start]
-        rates = {"translation": Rate(*shift, shift_from), "rotation": Rate(*turn, turn_from)}
-        if config.net.coupled:
-            rates = {"coupled": rates["rotation"]}
-        rates = rates if config.net.window is None else rates | {"progress": Rate(1.0, 1.0)}
-        return fields.posenet(posenet), rates
-    if paper:
-        shift = turn = (3e-3 if photographs.spacing == "disparity" else 1e-3, 1e-5)
+    elif paper:
+        shift = turn = (3e-3 if problem.train.spacing == "disparity" else 1e-3, 1e-5)
     else:
         shift, turn = _PER_FRAME_RATES[start]
-    if config.pose == "bspline":
-        field, columns = fields.bspline(span, config.spline_knots), (3, 4)
-    else:
-        field, columns = fields.per_frame_poses(photographs.t), (3, 3)
-    pairs = zip((*shift, shift_from), (*turn, turn_from), strict=True)
-    return field, Rate(*(np.repeat(pair, columns)[None] for pair in pairs))
+    shift_from, turn_from = (0.0, 0.0) if paper else (_SHIFT_FROM, _TURN_FROM)
+    return {"translation": Decay(*shift, shift_from), "rotation": Decay(*turn, turn_from)}
+
+
+def _pose_rates(config: Config, rates: dict[str, Decay], steps: int) -> Any:
+    """The rates as a prefix of the pose field's parameters."""
+    if config.pose == "posenet":
+        of_net = {"coupled": rates["rotation"]} if config.net.coupled else rates
+        return of_net if config.net.window is None else of_net | {"progress": 0.0}
+    # A row of parameters is a pose: three columns of translation, then those of rotation.
+    shift, turn = rates["translation"].schedule(steps), rates["rotation"].schedule(steps)
+    columns = np.array([[True] * 3 + [False] * (4 if config.pose == "bspline" else 3)])
+    return lambda step: jnp.where(columns, shift(step), turn(step))
 
 
 def _fast_scene(config: Config) -> NerfConfig:
