@@ -11,8 +11,8 @@ from jaxpose.errors import DataError
 from jaxpose.experiments.progress import OnUpdate, Update, silent
 from jaxpose.files.atomic import atomic
 
-_WIDTH = 320  # [px] of a render
-_FRAMES_PER_S, _MOST = 8, 100
+_WIDTH = 240  # [px] of a render
+_FRAMES_PER_S, _MOST = 6, 100
 _MARGIN = 0.12  # of the panel, around the path
 _ESTIMATE, _GROUND_TRUTH, _PAPER = (31, 95, 168), (150, 150, 150), (255, 255, 255)
 
