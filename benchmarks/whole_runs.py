@@ -72,9 +72,8 @@ def main() -> None:
                             tree, config.command, folder / f"{name}-{k}", folder / f"{name}-{k}-{kind}"
                         )
                         runs.setdefault((kind, name), []).append(run)
-                        print(
-                            f"  {kind} {name}: {run.wall_s:.0f} s, {run.cpu_s:.0f} CPU s, {run.peak_gib:.2f} GiB"
-                        )
+                        took = f"{run.wall_s:.0f} s, {run.cpu_s:.0f} CPU s, {run.peak_gib:.2f} GiB"
+                        print(f"  {kind} {name}: {took}", flush=True)
         finally:
             subprocess.run(["git", "-C", ROOT, "worktree", "remove", "--force", other], check=True)
     for kind in ("cold", "warm"):
