@@ -19,7 +19,7 @@ SILENT = {f"{room}.{name}" for room, names in {
     "datasets.events": "detect find find_format load load_events npz_stream",
     "datasets": "every select take thin",
     "datasets.photos": "load transforms_file write_transforms",
-    "datasets.rgbd": "detect find_format load load_camera load_imu load_recording load_truth read_list",
+    "datasets.rgbd": "detect find_format load load_camera load_recording read_list",
     "datasets.synthetic": (
         "camera correlated distance event_orbit image independent orbit orbit_poses paint "
         "room"
@@ -32,10 +32,7 @@ SILENT = {f"{room}.{name}" for room, names in {
         "change_residual cumulative_polarity find_displacement index_by_pixel locate log_intensity "
         "mosaic_mask simulate warped"
     ),
-    "files": (
-        "load peak_rss_bytes read_camera read_points save versions write_camera "
-        "write_colmap write_ply"
-    ),
+    "files": "load peak_rss_bytes read_camera read_points save versions write_camera write_colmap write_ply",
     "imu": (
         "accelerometer_residual add_noise backward covers difference filter_imu forward gravity_note "
         "gyro_loose_residual gyro_tight_residual imu_residuals integrate_gyro interpolant propagate "
