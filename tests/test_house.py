@@ -16,28 +16,6 @@ LONG_FUNCTIONS = {
 }
 # Public functions whose docstring lacks Args or Returns. They go as they get them; nothing is added.
 SILENT = {f"{room}.{name}" for room, names in {
-    "datasets.events": "detect find find_format load load_events npz_stream",
-    "datasets": "every select take thin",
-    "datasets.photos": "load transforms_file write_transforms",
-    "datasets.rgbd": "detect find_format load load_camera load_recording read_list",
-    "datasets.synthetic": (
-        "camera correlated distance event_orbit image independent orbit orbit_poses paint "
-        "room"
-    ),
-    "evaluation": (
-        "align align_trajectory ate lpips path_length pose_errors procrustes psnr rpe ssim "
-        "statistics umeyama"
-    ),
-    "events": (
-        "change_residual cumulative_polarity find_displacement index_by_pixel locate log_intensity "
-        "mosaic_mask simulate warped"
-    ),
-    "files": "load peak_rss_bytes read_camera read_points save versions write_camera write_colmap write_ply",
-    "imu": (
-        "accelerometer_residual add_noise backward covers difference filter_imu forward gravity_note "
-        "gyro_loose_residual gyro_tight_residual imu_residuals integrate_gyro interpolant propagate "
-        "remove_gravity residual_sigmas retract rotate simulate simulate_from_poses transition windows"
-    ),
     "jaxpose": "weighted_mean",
     "slam": "finish load run save",
 }.items() for name in names.split()}  # fmt: skip

@@ -138,6 +138,6 @@ def test_the_commands_take_the_recording_s_own_imu(desk, walk, save):
     source = load(imu_slam.Config(data=mav0.parent, start=1))
     assert source.metadata["format"] == "euroc"
     assert source.imu == "200 Hz, the recording's own, as read"
-    np.testing.assert_allclose(source.recording.t, np.arange(5) * 0.05, atol=1e-9)
-    np.testing.assert_allclose(source.recording.imu.t, np.arange(60) * 0.005 - 0.05, atol=1e-9)
+    np.testing.assert_allclose(source.recording.t, (1 + np.arange(5)) * 0.05, atol=1e-9)  # the clock stays
+    np.testing.assert_allclose(source.recording.imu.t, np.arange(60) * 0.005, atol=1e-9)
     np.testing.assert_array_equal(source.recording.imu.omega_body[:, 0], np.arange(60))

@@ -89,7 +89,7 @@ def test_a_blind_pixel_counts_from_the_level_that_it_finds():
 
 def test_thresholds_spread_and_false_events_are_as_many_as_asked():
     ramp = [(0.0, np.zeros((100, 100))), (1.0, np.full((100, 100), 50.0))]
-    events = simulate(ramp, 0.25, spread=0.03, seed=3)
+    events = simulate(ramp, 0.25, threshold_sigma=0.03, seed=3)
     fired = np.bincount(events.y.astype(int) * 100 + events.x, minlength=10_000)
     thresholds = 50 / (fired + 0.5)
     assert_allclose(thresholds.mean(), 0.25, atol=3 * 0.03 / 100)
@@ -105,7 +105,7 @@ def test_thresholds_spread_and_false_events_are_as_many_as_asked():
 
 def test_bad_settings_and_stamps_are_refused():
     images = walk(images=3)
-    for settings in ({"threshold": 0.0}, {"threshold": 0.1, "spread": -1.0}):
+    for settings in ({"threshold": 0.0}, {"threshold": 0.1, "threshold_sigma": -1.0}):
         with pytest.raises(ValueError, match="expected threshold > 0"):
             simulate(images, **settings)
     with pytest.raises(DataError, match="timestamps that increase, got 0.1 s after 0.2 s"):

@@ -17,7 +17,7 @@ from jaxpose.geometry.rigid import nearest_rotation
 SUFFIXES = (".png", ".jpg", ".jpeg")
 INTRINSICS = "camera-intrinsics.txt"
 _NONE = 65535  # like 0, no measurement: sensors and renderers clip what is too far to it
-_MOST_OFF_ROTATION = 1e-2  # entries of a rotation matrix; beyond it the user is told
+_MOST_OFF_ROTATION = 1e-2  # entries of a rotation matrix; beyond it a note says so
 _DEPTH_SAMPLES = 5  # depth images looked at before a sequence is accepted
 
 

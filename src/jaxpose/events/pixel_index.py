@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxpose.events.types import AnyArray, Events
+from jaxpose.events.types import AnyArray, Events, check_events
 
 
 class PixelIndex(NamedTuple):
@@ -21,7 +21,28 @@ class PixelIndex(NamedTuple):
 
 
 def index_by_pixel(events: Events, height: int, width: int) -> PixelIndex:
-    """The events of each pixel; numpy, timestamps in float64 as they are."""
+    """Sort events by pixel.
+
+    Args:
+        events: In the order of time, on the sensor.
+        height: Rows of the sensor.
+        width: Columns of the sensor.
+
+    Returns:
+        The events of each pixel; numpy, timestamps in float64 as they are.
+
+    Raises:
+        ValueError: For events beyond the sensor, and for columns of another shape or type.
+
+    >>> events = Events(np.array([0.0, 1.0]), np.uint16([1, 1]), np.uint16([0, 0]), np.int8([1, -1]))
+    >>> index_by_pixel(events, height=1, width=2).level.tolist()
+    [1, 0]
+    """
+    check_events(events)
+    if len(events.t) and (events.x.max() >= width or events.y.max() >= height):
+        raise ValueError(
+            f"events: expected pixels of {width}x{height}, got column {events.x.max()}, row {events.y.max()}"
+        )
     pixel = events.y.astype(np.int32) * width + events.x
     order = np.argsort(pixel, kind="stable")
     count = np.bincount(pixel, minlength=height * width).astype(np.int32)
@@ -32,7 +53,16 @@ def index_by_pixel(events: Events, height: int, width: int) -> PixelIndex:
 
 
 def cumulative_polarity(streams: PixelIndex, pixel: Int[Array, ""], t: Float[Array, ""]) -> Int[Array, ""]:
-    """Sum of the polarities of a pixel's events up to `t` [s], those at `t` included; by bisection."""
+    """Sum of the polarities of a pixel's events up to a time, by bisection.
+
+    Args:
+        streams: Events by pixel.
+        pixel: row * width + column.
+        t: [s]; events at `t` itself are included.
+
+    Returns:
+        A whole number, 0 before the first event.
+    """
     first, count = streams.first[pixel], streams.count[pixel]
     if len(streams.t) == 0:
         return jnp.zeros((), jnp.int32)

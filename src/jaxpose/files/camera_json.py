@@ -1,4 +1,4 @@
-"""What a run folder says of its camera, `camera.json`: intrinsics, and the name of each frame's image."""
+"""The camera of a run folder, `camera.json`: intrinsics, and the name of each frame's image."""
 
 import json
 from pathlib import Path
@@ -18,12 +18,29 @@ class CameraFile(NamedTuple):
 
 
 def write_camera(path: Path | str, camera: Camera, images: tuple[str, ...], folder: Path | str) -> None:
-    """Write `camera.json`; `folder` is absolute, or relative to the file."""
+    """Write `camera.json`.
+
+    Args:
+        path: The file, written whole or not at all.
+        camera: Of the images as the run used them.
+        images: A name for each frame, relative to `folder`; empty where they are on no disk.
+        folder: Absolute, or relative to the file.
+    """
     write_json(path, {**camera._asdict(), "images": images, "images_folder": str(folder)})
 
 
 def read_camera(path: Path | str) -> CameraFile:
-    """Read `camera.json`; DataError naming it for what is not one."""
+    """Read `camera.json`.
+
+    Args:
+        path: The file, of a run folder.
+
+    Returns:
+        The camera, and where the images are.
+
+    Raises:
+        DataError: Naming the file for what is not one.
+    """
     path = Path(path)
     if not path.is_file():
         raise DataError(

@@ -13,16 +13,29 @@ from jaxpose.files.atomic import atomic
 
 
 def save(path: Path | str, tree: Any) -> None:
-    """Write the arrays and random keys of a pytree (npz, by their place in it)."""
+    """Write the arrays and random keys of a pytree (npz, by their place in it).
+
+    Args:
+        path: The file, written whole or not at all.
+        tree: A pytree of arrays, numbers and random keys.
+    """
     arrays = {jax.tree_util.keystr(at): np.asarray(_data(leaf)) for at, leaf in _leaves(tree)}
     with atomic(path) as temporary:
         np.savez(temporary, allow_pickle=False, **arrays)
 
 
 def load(path: Path | str, like: Any) -> Any:
-    """Read what `save` wrote, into a tree of the shape of `like`, bit by bit as it was.
+    """Read what `save` wrote, bit by bit as it was.
 
-    DataError naming the file if it is damaged or holds other arrays.
+    Args:
+        path: The file.
+        like: A tree of the same structure, shapes and types.
+
+    Returns:
+        A tree like it.
+
+    Raises:
+        DataError: Naming the file if it is damaged or holds other arrays.
     """
     expected = _leaves(like)
     try:

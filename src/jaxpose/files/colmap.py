@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from jaxpose._checks import check_shapes
 from jaxpose.errors import DataError
 from jaxpose.files.atomic import write_text
 from jaxpose.geometry.camera import Camera
@@ -15,12 +16,23 @@ from jaxpose.geometry.camera import Camera
 def write_colmap(
     folder: Path | str, camera: Camera, images: Sequence[str], T_world_cam: Float[np.ndarray, "n 4 4"]
 ) -> None:
-    """Write one camera, the pose of each image by its name, and no points, as COLMAP documents the format.
+    """Write one camera, and the pose of each image by its name, as COLMAP documents its text model.
 
     Image poses are world-to-camera, quaternions wxyz, camera axes OpenCV's; the centre of the first pixel is
-    (0.5, 0.5). DataError for poses with NaN or infinity, and for names that repeat or hold blanks.
+    (0.5, 0.5).
+
+    Args:
+        folder: Made if it is not there; `cameras.txt`, `images.txt` and `points3D.txt` are written.
+        camera: Of all images.
+        images: Their names (n,), without blanks and each its own.
+        T_world_cam: Poses (n, 4, 4), finite.
+
+    Raises:
+        DataError: For poses with NaN, and for names that repeat or hold blanks.
+        ValueError: For an array of another shape.
     """
     folder = Path(folder)
+    check_shapes(images=(images, "n"), T_world_cam=(T_world_cam, "n 4 4"))
     finite = np.isfinite(T_world_cam).all((1, 2))
     if not finite.all():
         raise DataError(
@@ -52,7 +64,7 @@ def write_colmap(
 
 
 def _model(camera: Camera) -> tuple[str, tuple[float, ...]]:
-    """The least of COLMAP's camera models that holds the lens, and its parameters."""
+    """The least of COLMAP's camera models that holds the distortion, and its parameters."""
     pinhole = (camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5)
     if not any(camera.distortion):
         return "PINHOLE", pinhole

@@ -6,6 +6,7 @@ from typing import BinaryIO
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+from jaxpose._checks import check_shapes
 from jaxpose.errors import DataError
 from jaxpose.files.atomic import atomic
 
@@ -19,10 +20,17 @@ _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 
 
 def read_points(path: Path | str) -> Float[np.ndarray, "n 3"]:
-    """The x, y, z of the vertices of a PLY file, ascii or binary, float64; all else in it is passed over.
+    """Read the vertices of a PLY file, ascii or binary; all else in it is passed over.
 
-    Vertices must come before other elements and have no lists, as scanners and mesh tools write them.
-    DataError naming the file (and the line of a header or text) for what cannot be read; OSError as usual.
+    Args:
+        path: Vertices must come before other elements and have no lists, as scanners and mesh tools write
+            them.
+
+    Returns:
+        x, y, z (n, 3), float64.
+
+    Raises:
+        DataError: Naming the file (and the line of a header or text) for what cannot be read.
     """
     path = Path(path)
     with path.open("rb") as stream:
@@ -47,7 +55,26 @@ def write_ply(
     rgb: UInt8[np.ndarray, "n 3"],
     faces: Int[np.ndarray, "m 3"] | None = None,
 ) -> None:
-    """Write coloured points [m], or triangles between them too, as binary PLY in float32; atomically."""
+    """Write coloured points, or triangles between them too, as binary PLY in float32.
+
+    Args:
+        path: The file, written whole or not at all.
+        points: (n, 3) [m].
+        rgb: Colours (n, 3), uint8.
+        faces: Corners (m, 3) of triangles, as rows of `points`.
+
+    Raises:
+        ValueError: For arrays of other shapes or types, and for corners that are no rows of `points`.
+    """
+    check_shapes(points=(points, "n 3"), rgb=(rgb, "n 3"))
+    if np.asarray(rgb).dtype != np.uint8:
+        raise ValueError(f"rgb: expected uint8, got {np.asarray(rgb).dtype}")
+    if faces is not None:
+        check_shapes(faces=(faces, "m 3"))
+        if len(faces) and not 0 <= faces.min() <= faces.max() < len(points):
+            raise ValueError(
+                f"faces: expected rows of {len(points)} points, got {faces.min()} to {faces.max()}"
+            )
     vertex = np.dtype([(axis, "<f4") for axis in "xyz"] + [(c, "u1") for c in ("red", "green", "blue")])
     vertices = np.empty(len(points), vertex)
     for k, axis in enumerate("xyz"):

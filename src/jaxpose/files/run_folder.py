@@ -59,7 +59,11 @@ def opened(folder: Path) -> Iterator[Path]:
 
 
 def peak_rss_bytes() -> int:
-    """The most memory this process has held."""
+    """The most memory that this process has held.
+
+    Returns:
+        [bytes].
+    """
     status = Path("/proc/self/status")
     for line in status.read_text().splitlines() if status.exists() else ():
         if line.startswith("VmHWM:"):
@@ -72,7 +76,11 @@ def peak_rss_bytes() -> int:
 
 
 def versions() -> dict[str, str]:
-    """What a result depends on besides its configuration: software and device."""
+    """What a result depends on besides its configuration: software and device.
+
+    Returns:
+        Versions and names by what they are of.
+    """
     import jax  # slow to load, and files of trajectories are read without it
 
     return {

@@ -1,9 +1,9 @@
-"""Error-state Kalman filter and smoother of IMU readings and poses (METHOD section 5), pure and traceable.
+"""Error-state Kalman filter and smoother of IMU readings and poses pure and traceable.
 
 The readings drive the prediction, poses correct it (a multiplicative filter, after Sola, "Quaternion
 kinematics for the error-state Kalman filter", 2017). The error has 15 components: position and velocity
 [m, m/s, world], rotation [rad, right increment], bias of the gyroscope [rad/s] and the accelerometer [m/s^2].
-`imu_filter.filter_imu` is the way in for recordings.
+`filtering.filter_imu` is the way in for recordings.
 """
 
 from typing import NamedTuple
@@ -24,7 +24,7 @@ class PoseNoise(NamedTuple):
 
 
 class State(NamedTuple):
-    """What the filter knows the mean of."""
+    """The mean of what the filter estimates."""
 
     T_world_body: Float[Array, "*n 4 4"]
     velocity_world: Float[Array, "*n 3"]
@@ -33,18 +33,18 @@ class State(NamedTuple):
 
 
 class Step(NamedTuple):
-    """From one reading to the next, and the pose measured `late` seconds after the latter (or before it)."""
+    """From one reading to the next, and the pose that corrects the state at the latter."""
 
     dt: Float[Array, "*n"]
     omega_body: Float[Array, "*n 2 3"]  # readings at both ends
     acceleration_body: Float[Array, "*n 2 3"]
     T_world_body: Float[Array, "*n 4 4"]  # finite, but any where none was measured
-    late: Float[Array, "*n"]
+    time_offset: Float[Array, "*n"]  # [s] from the reading to the pose
     measured: Bool[Array, "*n"]
 
 
 class FilterStep(NamedTuple):
-    """What each step leaves behind, for the smoother and for the user."""
+    """The outcome of each step, for the smoother and for the user."""
 
     predicted: State
     predicted_covariance: Float[Array, "*n 15 15"]
@@ -57,7 +57,16 @@ class FilterStep(NamedTuple):
 
 
 def retract(state: State, error: Float[Array, "15"]) -> State:
-    """The state that is `error` away."""
+    """The state that an error leads to.
+
+    Args:
+        state: The state to begin from.
+        error: (15,): position [m, world], velocity [m/s], rotation [rad, right increment], bias of the
+            gyroscope [rad/s] and of the accelerometer [m/s^2].
+
+    Returns:
+        The state that is `error` away (Sola 2017, section 5).
+    """
     position, velocity, rotation, gyro_bias, accelerometer_bias = jnp.split(error, 5)
     T = state.T_world_body
     return State(
@@ -69,7 +78,15 @@ def retract(state: State, error: Float[Array, "15"]) -> State:
 
 
 def difference(a: State, b: State) -> Float[Array, "15"]:
-    """The error that takes a to b: `retract(a, difference(a, b)) = b`."""
+    """The error between two states, the inverse of `retract`.
+
+    Args:
+        a: The state to begin from.
+        b: The state to arrive at.
+
+    Returns:
+        (15,), so that `retract(a, difference(a, b))` is b.
+    """
     T_a, T_b = a.T_world_body, b.T_world_body
     return jnp.concatenate(
         [
@@ -89,7 +106,18 @@ def propagate(
     acceleration_body: Float[Array, "2 3"],
     gravity_world: Float[Array, "3"],
 ) -> State:
-    """The state `dt` later from the readings at both ends (trapezoidal rule; biases stay)."""
+    """The state some time later, by the readings at both ends (trapezoidal rule; biases stay).
+
+    Args:
+        state: The state at the first reading.
+        dt: [s] between the readings.
+        omega_body: Body rates (2, 3) [rad/s] as read.
+        acceleration_body: Specific forces (2, 3) [m/s^2] as read, gravity in them.
+        gravity_world: (3,) [m/s^2].
+
+    Returns:
+        The state at the second reading.
+    """
     T = state.T_world_body
     turn = se3.so3_exp((omega_body.mean(axis=0) - state.gyro_bias) * dt)
     R_world_next = _product(T[:3, :3], turn)
@@ -108,7 +136,19 @@ def transition(
     acceleration_body: Float[Array, "2 3"],
     gravity_world: Float[Array, "3"],
 ) -> tuple[State, Float[Array, "15 15"]]:
-    """`propagate`, and the matrix by which a small error of the state goes on."""
+    """`propagate`, and how a small error of the state goes on.
+
+    Args:
+        state: The state at the first reading.
+        dt: [s] between the readings.
+        omega_body: Body rates (2, 3) [rad/s] as read.
+        acceleration_body: Specific forces (2, 3) [m/s^2] as read.
+        gravity_world: (3,) [m/s^2].
+
+    Returns:
+        The state at the second reading, and the matrix (15, 15) from the error before to that after, by
+        forward mode.
+    """
     ahead = lambda start: propagate(start, dt, omega_body, acceleration_body, gravity_world)
     after = ahead(state)
     grow = lambda error: difference(after, ahead(retract(state, error)))
@@ -126,17 +166,17 @@ def _predict(state, covariance, step: Step, noise: ImuNoise, gravity_world):
 
 
 def _correct(state, covariance, step: Step, pose_noise: PoseNoise):
-    def rest(error):
+    def residual(error):
         """The measured pose against that of the state, carried to the pose's own time by its own motion."""
         at = retract(state, error)
-        turn = se3.so3_exp((step.omega_body[1] - at.gyro_bias) * step.late)
+        turn = se3.so3_exp((step.omega_body[1] - at.gyro_bias) * step.time_offset)
         R_world_body = _product(at.T_world_body[:3, :3], turn)
-        position = at.T_world_body[:3, 3] + at.velocity_world * step.late
+        position = at.T_world_body[:3, 3] + at.velocity_world * step.time_offset
         rotation = se3.so3_log(_product(R_world_body.T, step.T_world_body[:3, :3]))
         return jnp.concatenate([step.T_world_body[:3, 3] - position, rotation])
 
     zero = jnp.zeros(15, covariance.dtype)
-    innovation, H = rest(zero), -jax.jacfwd(rest)(zero)
+    innovation, H = residual(zero), -jax.jacfwd(residual)(zero)
     N = jnp.diag(jnp.repeat(jnp.stack([pose_noise.position, pose_noise.rotation]) ** 2, 3))
     S = _sandwich(H, covariance) + N
     solved = jnp.linalg.solve(S, jnp.concatenate([_product(H, covariance), innovation[:, None]], axis=1))
@@ -155,27 +195,48 @@ def forward(
     pose_noise: PoseNoise,
     gravity_world: Float[Array, "3"],
 ) -> FilterStep:
-    """The filter over all `steps` from the `start` and its covariance; noise as scalar arrays."""
+    """The filter over all steps.
+
+    Args:
+        start: The state at the first reading.
+        covariance: Of its error (15, 15).
+        steps: One from each reading to the next.
+        noise: Of the readings, as scalar arrays.
+        pose_noise: Of the measured poses, as scalar arrays.
+        gravity_world: (3,) [m/s^2].
+
+    Returns:
+        What each step left behind.
+    """
 
     def step(carry: tuple[State, Float[Array, "15 15"]], step: Step):
         predicted, P, F = _predict(*carry, step, noise, gravity_world)
         state, covariance, innovation, S, nis = _correct(predicted, P, step, pose_noise)
-        passed = FilterStep(predicted, P, F, state, covariance, innovation, S, nis)
-        return (state, covariance), passed
+        filtered = FilterStep(predicted, P, F, state, covariance, innovation, S, nis)
+        return (state, covariance), filtered
 
     return jax.lax.scan(step, (start, covariance), steps)[1]
 
 
 @jax.jit
 def backward(
-    start: State, covariance: Float[Array, "15 15"], passed: FilterStep
+    start: State, covariance: Float[Array, "15 15"], filtered: FilterStep
 ) -> tuple[State, Float[Array, "n 15 15"]]:
-    """States and covariances given later poses too, the `start` first (Rauch, Tung and Striebel)."""
-    last = jax.tree.map(lambda x: x[-1], (passed.state, passed.covariance))
+    """States and covariances given later poses too (Rauch, Tung and Striebel 1965).
+
+    Args:
+        start: The state that `forward` began from.
+        covariance: Of its error (15, 15).
+        filtered: What `forward` returned.
+
+    Returns:
+        States and covariances at all readings, the first included.
+    """
+    last = jax.tree.map(lambda x: x[-1], (filtered.state, filtered.covariance))
     before = jax.tree.map(
         lambda first, x: jnp.concatenate([first[None], x[:-1]]),
         (start, covariance),
-        (passed.state, passed.covariance),
+        (filtered.state, filtered.covariance),
     )
 
     def step(later, row):
@@ -185,7 +246,7 @@ def backward(
         smoothed = state, P + _sandwich(C, later[1] - predicted_P)
         return smoothed, smoothed
 
-    rows = before, passed.predicted, passed.predicted_covariance, passed.transition
+    rows = before, filtered.predicted, filtered.predicted_covariance, filtered.transition
     _, smoothed = jax.lax.scan(step, last, rows, reverse=True)
     return jax.tree.map(lambda x, end: jnp.concatenate([x, end[None]]), smoothed, last)
 

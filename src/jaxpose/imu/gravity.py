@@ -1,11 +1,12 @@
-"""Whether what an accelerometer reads along true poses is gravity."""
+"""Whether the mean of what an accelerometer reads along ground truth is gravity."""
 
 import numpy as np
 from jaxtyping import Float
 
+from jaxpose._checks import check_shapes
 from jaxpose.geometry.rigid import vector_angle
 
-_MOST_OFF_UP_DEG, _MOST_OFF_GRAVITY = 10.0, 0.1  # of the mean specific force, before it is told
+_MOST_OFF_UP_DEG, _MOST_OFF_GRAVITY = 10.0, 0.1  # of the mean specific force, before a note says so
 
 
 def gravity_note(
@@ -16,12 +17,25 @@ def gravity_note(
     gravity_world: Float[np.ndarray, "3"],
     sensor: str,
 ) -> tuple[str, ...]:
-    """A note if the mean of `force` [m/s^2, sensor axes] in the world is far from the opposite of gravity.
+    """Compare the mean of an accelerometer's readings with gravity.
 
-    Over the true poses at `t` [s], NaN where one is missing, that lie within the readings; none where those
-    are fewer than two. What moves comes to rest again, so over a recording its own acceleration has no mean.
-    `sensor` is its name in the note.
+    What moves comes to rest again, so over a recording its own acceleration has no mean.
+
+    Args:
+        read_at: Timestamps (m,) [s] of the readings.
+        force: Specific forces (m, 3) [m/s^2] in the sensor's axes.
+        t: Timestamps (n,) [s] of ground truth; those within the readings are used.
+        T_world_sensor: Ground truth (n, 4, 4), NaN where it is missing.
+        gravity_world: (3,) [m/s^2].
+        sensor: The sensor's name in the note.
+
+    Returns:
+        A note if the mean in the world is more than 10 degrees or 10% off the opposite of gravity; none if it
+        is not, or if fewer than two poses can be used.
     """
+    check_shapes(
+        read_at=(read_at, "m"), force=(force, "m 3"), t=(t, "n"), T_world_sensor=(T_world_sensor, "n 4 4")
+    )
     usable = (t >= read_at[0]) & (t <= read_at[-1]) & np.isfinite(T_world_sensor).all(axis=(1, 2))
     if usable.sum() < 2:
         return ()

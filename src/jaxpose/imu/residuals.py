@@ -2,7 +2,7 @@
 
 Pose functions `t -> T_ref_body` are of the body, which is the IMU, in a frame that does not move: the
 world, or the body's own frame at the last image. For a field of camera poses compose `T_cam_body` on the
-right. Simulation is in `imu_simulation.py`.
+right. Ma et al. 2024, section 3.4.
 """
 
 from typing import NamedTuple
@@ -13,11 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxpose._checks import check_increasing, check_shapes
 from jaxpose.errors import DataError
 from jaxpose.fields.derivatives import PoseFn, motion, velocity
 from jaxpose.geometry import se3
 from jaxpose.imu.preintegration import rotate
-from jaxpose.imu.types import Imu, ImuNoise
+from jaxpose.imu.types import Imu, ImuNoise, check_readings
 
 
 class ImuResiduals(NamedTuple):
@@ -39,10 +40,26 @@ class ResidualSigmas(NamedTuple):
 def residual_sigmas(noise: ImuNoise, rate_hz: float, duration: float) -> ResidualSigmas:
     """What to divide the residuals by so that a weight of 1 means one sigma of the sensor.
 
-    `duration` [s] is how long the gyroscope was integrated: its error walks, so `loose` holds at the end of
-    that time, and neighbouring samples share nearly all of it. METHOD's lambda of 1 is a weight of sigma here
-    for the accelerometer and of sigma / 2 for its quaternion residuals. Zero for a silent sensor.
+    Ma et al.'s lambda of 1 is a weight of sigma here for the accelerometer and of sigma / 2 for its
+    quaternion residuals.
+
+    Args:
+        noise: The sensor's data sheet.
+        rate_hz: Readings a second.
+        duration: How long [s] the gyroscope was integrated: its error walks, so `loose` holds at the end of
+            that time, and neighbouring samples share nearly all of it.
+
+    Returns:
+        One standard deviation of each residual; zero for a silent sensor.
+
+    Raises:
+        ValueError: For a rate that is not positive, or a duration below 0.
+
+    >>> residual_sigmas(ImuNoise(1e-4, 2e-3, 0.0, 0.0), rate_hz=100.0, duration=1.0).tight
+    0.001
     """
+    if not (0 < rate_hz < np.inf and 0 <= duration < np.inf):
+        raise ValueError(f"expected rate_hz above 0 and duration of 0 or more, got {rate_hz} and {duration}")
     per_sample = np.sqrt(rate_hz)
     return ResidualSigmas(
         loose=float(noise.gyro_density * np.sqrt(max(duration, 1 / rate_hz))),
@@ -51,7 +68,7 @@ def residual_sigmas(noise: ImuNoise, rate_hz: float, duration: float) -> Residua
     )
 
 
-# Why rotation vectors. METHOD takes the L1 norm between quaternions, and between dq/dt and
+# Why rotation vectors. Ma et al. 2024 take the L1 norm between quaternions, and between dq/dt and
 # q * (0, omega) / 2. The first is, to first order, half the rotation vector from one to the other; the second
 # is exactly half the difference of the body rates; both turned by q. Without the turn and the half they are
 # the same loss along the sensor's own three axes, in radians, and signless: q and -q are one rotation matrix.
@@ -60,18 +77,40 @@ def residual_sigmas(noise: ImuNoise, rate_hz: float, duration: float) -> Residua
 def gyro_loose_residual(
     pose_fn: PoseFn, times: Float[Array, " n"], R_ref_body: Float[Array, "n 3 3"]
 ) -> Float[Array, "n 3"]:
-    """Rotation vector [rad] from the integrated gyroscope to the field (METHOD section 5, gyro, loose).
+    """Rotation vectors from the integrated gyroscope to the field (Ma et al. 2024, gyroscope, loose).
 
-    `R_ref_body` is `integrate_gyro`'s, started in the frame that `pose_fn` refers to.
+    Args:
+        pose_fn: The body's pose `T_ref_body` (4, 4) at a time [s], in a frame that does not move.
+        times: (n,) [s].
+        R_ref_body: (n, 3, 3), `integrate_gyro`'s, started in the frame that `pose_fn` refers to.
+
+    Returns:
+        (n, 3) [rad].
+
+    Raises:
+        ValueError: For other shapes.
     """
+    check_shapes(times=(times, "n"), R_ref_body=(R_ref_body, "n 3 3"))
     return _rotation_error(R_ref_body, jax.vmap(pose_fn)(times))
 
 
 def gyro_tight_residual(
     pose_fn: PoseFn, times: Float[Array, " n"], omega_body: Float[Array, "n 3"]
 ) -> Float[Array, "n 3"]:
-    """Body rate of the field minus the gyroscope's [rad/s] (METHOD section 5, gyro, tight)."""
-    chex.assert_equal_shape_prefix([times, omega_body], 1)
+    """Body rate of the field less the gyroscope's (Ma et al. 2024, gyroscope, tight).
+
+    Args:
+        pose_fn: The body's pose `T_ref_body` (4, 4) at a time [s], in a frame that does not move.
+        times: (n,) [s].
+        omega_body: Body rates (n, 3) [rad/s] as read.
+
+    Returns:
+        (n, 3) [rad/s].
+
+    Raises:
+        ValueError: For other shapes.
+    """
+    check_shapes(times=(times, "n"), omega_body=(omega_body, "n 3"))
     _, _, omega_field = jax.vmap(lambda t: velocity(pose_fn, t))(times)
     return omega_field - omega_body
 
@@ -82,10 +121,24 @@ def accelerometer_residual(
     acceleration_body: Float[Array, "n 3"],
     R_ref_body: Float[Array, "n 3 3"],
 ) -> Float[Array, "n 3"]:
-    """Second derivative of the field's translation minus the gravity-free reading [m/s^2] (METHOD eq. 8).
+    """Second derivative of the field's translation less the reading (Ma et al. 2024, eq. 8).
 
-    In the frame that `pose_fn` refers to; `R_ref_body` (`integrate_gyro`) turns the reading into it.
+    Args:
+        pose_fn: The body's pose `T_ref_body` (4, 4) at a time [s], in a frame that does not move.
+        times: (n,) [s].
+        acceleration_body: Readings without gravity (n, 3) [m/s^2], of `remove_gravity`.
+        R_ref_body: (n, 3, 3), `integrate_gyro`'s, started in the frame that `pose_fn` refers to, which turns
+            the readings into it.
+
+    Returns:
+        (n, 3) [m/s^2], in the frame that `pose_fn` refers to.
+
+    Raises:
+        ValueError: For other shapes.
     """
+    check_shapes(
+        times=(times, "n"), acceleration_body=(acceleration_body, "n 3"), R_ref_body=(R_ref_body, "n 3 3")
+    )
     acceleration = jax.vmap(lambda t: motion(pose_fn, t).acceleration_world)(times)
     return acceleration - rotate(R_ref_body, acceleration_body)
 
@@ -97,8 +150,27 @@ def imu_residuals(
     acceleration_body: Float[Array, "n 3"],
     R_ref_body: Float[Array, "n 3 3"],
 ) -> ImuResiduals:
-    """All three residuals from one pass through the field; arguments as the single ones have them."""
-    chex.assert_equal_shape_prefix([times, omega_body, acceleration_body, R_ref_body], 1)
+    """All three residuals from one pass through the field.
+
+    Args:
+        pose_fn: The body's pose `T_ref_body` (4, 4) at a time [s], in a frame that does not move.
+        times: (n,) [s].
+        omega_body: Body rates (n, 3) [rad/s] as read.
+        acceleration_body: Readings without gravity (n, 3) [m/s^2], of `remove_gravity`.
+        R_ref_body: (n, 3, 3), `integrate_gyro`'s, started in the frame that `pose_fn` refers to.
+
+    Returns:
+        What `gyro_loose_residual`, `gyro_tight_residual` and `accelerometer_residual` return.
+
+    Raises:
+        ValueError: For other shapes.
+    """
+    check_shapes(
+        times=(times, "n"),
+        omega_body=(omega_body, "n 3"),
+        acceleration_body=(acceleration_body, "n 3"),
+        R_ref_body=(R_ref_body, "n 3 3"),
+    )
     field = jax.vmap(lambda t: motion(pose_fn, t))(times)
     return ImuResiduals(
         loose=_rotation_error(R_ref_body, field.pose),
@@ -108,18 +180,49 @@ def imu_residuals(
 
 
 def covers(imu: Imu, start: float, end: float) -> bool:
-    """Whether readings reach from `start` to `end` [s], to within one and a half samples."""
+    """Whether readings reach from one time to another, to within one and a half samples.
+
+    Args:
+        imu: Readings (n,).
+        start: [s] on their clock.
+        end: [s].
+
+    Returns:
+        False without readings.
+    """
     t = np.asarray(imu.t)
     slack = np.median(np.diff(t)) * 1.5 if len(t) > 1 else 0.0
     return bool(len(t) and start >= t[0] - slack and end <= t[-1] + slack)
 
 
 def windows(imu: Imu, frame_times: Float[np.ndarray, " m"]) -> tuple[Imu, Bool[np.ndarray, "m-1 s"]]:
-    """Cut readings (numpy) into the intervals between frames, padded to one size `s`, with a mask.
+    """Cut readings into the intervals between frames, padded to one size `s`.
 
     Each interval starts and ends at its frames, readings interpolated there; padding repeats the end.
-    An interval that the IMU does not cover is masked out. DataError if it covers none.
+
+    Args:
+        imu: Readings (n,), numpy.
+        frame_times: (m,) [s] on their clock, increasing.
+
+    Returns:
+        Readings (m - 1, s), and a mask (m - 1, s) that is False for padding and for intervals that the IMU
+        does not cover.
+
+    Raises:
+        DataError: If the IMU covers no interval, and for fewer than two readings or frames.
+        ValueError: For times that do not increase, and for other shapes.
+
+    >>> imu = Imu(np.arange(5.0), np.zeros((5, 3)), np.zeros((5, 3)))
+    >>> windows(imu, np.array([0.5, 2.5]))[0].t.tolist()
+    [[0.5, 1.0, 2.0, 2.5]]
     """
+    check_readings(imu)
+    check_shapes(frame_times=(frame_times, "m"))
+    check_increasing(**{"imu.t": np.asarray(imu.t), "frame_times": frame_times})
+    if len(imu.t) < 2 or len(frame_times) < 2:
+        raise DataError(
+            f"IMU: expected at least 2 readings and 2 frames, got {len(imu.t)} and {len(frame_times)}"
+        )
     t = np.asarray(imu.t)
     slack = np.median(np.diff(t)) * 1.5  # one sample short of a frame is no gap
     first, last = frame_times[:-1], frame_times[1:]

@@ -1,4 +1,4 @@
-"""What an IMU, ideal or noisy, reads along a pose function or along splines through stamped poses."""
+"""What an IMU, ideal or noisy, reads along a pose function or along splines through poses."""
 
 from collections.abc import Callable
 from typing import Literal, NamedTuple
@@ -10,10 +10,11 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline, Slerp
 
+from jaxpose._checks import check_shapes
 from jaxpose.errors import DataError
 from jaxpose.fields.derivatives import PoseFn, motion
 from jaxpose.geometry import rigid
-from jaxpose.imu.types import GRAVITY_WORLD, QUIET, Gravity, Imu, ImuNoise
+from jaxpose.imu.types import GRAVITY_WORLD, QUIET, Gravity, Imu, ImuNoise, check_readings
 
 
 def simulate(
@@ -24,10 +25,27 @@ def simulate(
     key: PRNGKeyArray | None = None,
     gravity_world: Gravity = GRAVITY_WORLD,
 ) -> Imu:
-    """Readings at `times` of an IMU whose pose is `pose_fn` (`t -> T_world_body`); jax arrays.
+    """Readings of an IMU along a pose function, by forward mode.
 
-    For an IMU on a camera pass `lambda t: se3.compose(camera_pose(t), T_cam_body)`. `key` makes the `noise`.
+    Args:
+        pose_fn: `T_world_body` (4, 4) at a time [s], body = IMU. For an IMU on a camera `lambda t:
+            se3.compose(camera_pose(t), T_cam_body)`.
+        times: (n,) [s].
+        noise: Of the sensor; none by default.
+        key: Makes the noise.
+        gravity_world: (3,) [m/s^2].
+
+    Returns:
+        Readings (n,), jax arrays.
+
+    Raises:
+        ValueError: For noise without a key, and for other shapes.
+
+    >>> imu = simulate(lambda t: jnp.eye(4), jnp.arange(3.0))
+    >>> np.asarray(imu.acceleration_body, np.float64)[0].round(3).tolist()
+    [0.0, 0.0, 9.807]
     """
+    check_shapes(times=(times, "n"), gravity_world=(gravity_world, "3"))
     at = jax.vmap(lambda t: motion(pose_fn, t))(times)
     gravity = jnp.asarray(gravity_world, at.pose.dtype)
     force = _to_body(at.pose[:, :3, :3], at.acceleration_world - gravity[None])
@@ -45,12 +63,31 @@ def simulate_from_poses(
     key: PRNGKeyArray | None = None,
     gravity_world: Gravity = GRAVITY_WORLD,
 ) -> Imu:
-    """Readings at `rate_hz` from the first to the last of stamped poses; numpy float64.
+    """Readings of an IMU along splines through poses, from the first to the last of them.
 
-    `poses` are `T_world_body`, or `T_world_cam` with the extrinsics `T_cam_body` of an IMU mounted elsewhere.
-    `rotation` as in `interpolant`; "slerp" is METHOD's. `key` is for `noise`.
+    Args:
+        times: Timestamps (n,) [s], increasing.
+        poses: `T_world_body` (n, 4, 4), or `T_world_cam` with the extrinsics of an IMU mounted elsewhere;
+            rows with NaN are left out and bridged.
+        rate_hz: Readings a second.
+        rotation: As in `interpolant`; "slerp" is Ma et al.'s.
+        T_cam_body: Where the IMU is on the camera (4, 4).
+        noise: Of the sensor; none by default.
+        key: Makes the noise.
+        gravity_world: (3,) [m/s^2].
+
+    Returns:
+        Readings, numpy float64.
+
+    Raises:
+        DataError: For fewer than two finite poses, and times that do not increase.
+        ValueError: For a rate that is not positive, noise without a key, and other shapes.
     """
+    check_shapes(times=(times, "n"), poses=(poses, "n 4 4"), gravity_world=(gravity_world, "3"))
+    if not 0 < rate_hz < np.inf:
+        raise ValueError(f"rate_hz: expected a positive number, got {rate_hz}")
     if T_cam_body is not None:
+        check_shapes(T_cam_body=(T_cam_body, "4 4"))
         # Before the splines: the body's own path is then smooth even where slerp makes it turn at once.
         poses = poses @ T_cam_body
     path = interpolant(times, poses, rotation)
@@ -61,7 +98,7 @@ def simulate_from_poses(
 
 
 class Interpolant(NamedTuple):
-    """A path through stamped poses: functions of times (n,) between `first` and `last` [s], float64."""
+    """A path through poses: functions of times (n,) between `first` and `last` [s], float64."""
 
     first: float
     last: float
@@ -76,12 +113,26 @@ def interpolant(
     poses: Float[np.ndarray, "n 4 4"],
     rotation: Literal["slerp", "spline"] = "slerp",
 ) -> Interpolant:
-    """Cubic splines through the positions; for the rotations slerp or a twice differentiable spline.
+    """A path through poses: cubic splines through positions, slerp or a spline through rotations.
 
-    Slerp is METHOD's (section 5); its body rate is constant between two timestamps and jumps at each.
-    Derivatives are the splines' own. Rows that are not finite (no ground truth) are left out and bridged.
-    DataError if fewer than two are left or the times do not rise.
+    Slerp's body rate is constant between two timestamps and jumps at each (Ma et al. 2024, section 4.1); the
+    spline is twice differentiable. Derivatives are the splines' own.
+
+    Args:
+        times: Timestamps (n,) [s], increasing.
+        poses: (n, 4, 4); rows with NaN (no ground truth) are left out and bridged.
+        rotation: "slerp" or "spline".
+
+    Returns:
+        The path as functions of time.
+
+    Raises:
+        DataError: If fewer than two poses are left, or the times do not increase.
+        ValueError: For another name, and for other shapes.
     """
+    check_shapes(times=(times, "n"), poses=(poses, "n 4 4"))
+    if rotation not in ("slerp", "spline"):
+        raise ValueError(f"rotation: expected slerp or spline, got {rotation!r}")
     usable = np.isfinite(poses).all(axis=(1, 2))
     times, poses = np.asarray(times, np.float64)[usable], np.asarray(poses, np.float64)[usable]
     if len(times) < 2:
@@ -105,11 +156,23 @@ def interpolant(
 
 
 def add_noise(imu: Imu, noise: ImuNoise, key: PRNGKeyArray | None) -> Imu:
-    """Readings with white noise (density / sqrt(dt)) and biases that walk from zero; numpy stays numpy.
+    """Readings with white noise (density / sqrt(dt)) and biases that walk from zero.
 
-    The draws are float32 in every case, so a key means the same noise in both precisions. ValueError for
-    noise without a key or without two readings, whose spacing is dt.
+    The draws are float32 in every case, so a key means the same noise in both precisions.
+
+    Args:
+        imu: Readings (n,), numpy or jax.
+        noise: Of the sensor.
+        key: Makes the noise.
+
+    Returns:
+        Readings of the same kind.
+
+    Raises:
+        ValueError: For noise without a key, or without two readings, whose spacing is dt; and for other
+            shapes.
     """
+    check_readings(imu)
     if noise == QUIET:
         return imu
     if key is None or len(imu.t) < 2:

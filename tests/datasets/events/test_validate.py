@@ -109,13 +109,13 @@ def test_a_unit_that_is_given_is_taken(made):
 
 def test_a_stated_unit_holds_unless_its_rate_is_impossible(made):
     t = np.arange(N) * 3
-    assert clean(stream_of(t, *made[1:], unit="s"), SIZE).tally.unit == "us"
+    assert clean(stream_of(t, *made[1:], unit="s"), SIZE).stats.unit == "us"
     (note,) = clean(stream_of(t, *made[1:], unit="s"), SIZE).notes
     assert "microseconds, as in the format's seconds their rate would be impossible" in note
     slow = clean(stream_of(np.arange(N) / 200, *made[1:], unit="s"), SIZE)
-    assert slow.tally.unit == "s" and slow.notes == ()
+    assert slow.stats.unit == "s" and slow.notes == ()
     few = clean(stream_of(*(c[:5] for c in (t, *made[1:])), unit="s"), SIZE)
-    assert few.tally.unit == "s" and few.events.t[-1] == 12
+    assert few.stats.unit == "s" and few.events.t[-1] == 12
 
 
 def test_one_stamp_for_all_has_a_unit():
@@ -165,7 +165,7 @@ def test_a_span_is_a_part(made):
         np.testing.assert_array_equal(a, b[inside])
     assert tally.count == N  # it ends less than 10 ms later
     late = clean(stream_of(made[0] * 100, *made[1:], step=100, unit="us"), SIZE, span=(0.001, 0.002))
-    assert late.tally.count < N / 10
+    assert late.stats.count < N / 10
 
 
 # --- what is refused ----------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ from jaxpose.cli.check.recording import check_camera
 from jaxpose.cli.check.timestamps import check_stamps
 from jaxpose.cli.check.trajectory import check_trajectory
 from jaxpose.datasets.events import registry as event_registry
-from jaxpose.datasets.events.stream import Stream, StreamStats, count, listed, reach
+from jaxpose.datasets.events.stream import Stream, StreamStats, count, in_words, reach
 from jaxpose.datasets.types import EventRecording
 from jaxpose.errors import DataError
 from jaxpose.files.tables import read_unchecked
@@ -50,7 +50,7 @@ def _events(stream: Stream, tally: StreamStats, size: tuple[int, int]) -> Checke
     span = tally.latest - tally.earliest
     rate = tally.count / max(span, 1e-12)
     kept = "the first " if tally.count >= _MOST else ""
-    text = f"{kept}{tally.count} in {span:.4g} s ({rate:.3g} Hz), polarities {listed(tally.polarities)}, "
+    text = f"{kept}{tally.count} in {span:.4g} s ({rate:.3g} Hz), polarities {in_words(tally.polarities)}, "
     text += f"pixels {reach(tally)} of {size[0]}x{size[1]}"
     fact = Fact("events", text, {"count": tally.count, "span_s": span, "rate_hz": rate})
     findings = []
@@ -63,7 +63,7 @@ def _events(stream: Stream, tally: StreamStats, size: tuple[int, int]) -> Checke
         findings.append(Finding("warning", "events", reach(tally), expected))
     if len(tally.polarities) < 2:
         expected = "polarities 0 and 1, or -1 and 1"
-        findings.append(Finding("warning", "events", f"only {listed(tally.polarities)}", expected))
+        findings.append(Finding("warning", "events", f"only {in_words(tally.polarities)}", expected))
     if span and (tally.unit != (stream.unit or tally.unit) or not _RATES_HZ[0] < rate < _RATES_HZ[1]):
         stated = f"100 Hz to 1 GHz of events, timestamps in {stream.unit or 's, us or ns'}"
         found = f"{rate:.3g} Hz with timestamps in {tally.unit}"

@@ -27,7 +27,14 @@ _EXACT_DIGITS = 15  # of a whole number in float64
 
 
 def detect(path: Path) -> bool:
-    """Whether a folder has a file of events in text."""
+    """Whether a folder has a file of events in text.
+
+    Args:
+        path: A folder.
+
+    Returns:
+        Whether `load` should read it.
+    """
     return any(path.glob("events*.txt"))
 
 
@@ -39,16 +46,29 @@ def load(
     unit: Unit | None = None,
     span: tuple[float, float] | None = None,
 ) -> EventRecording:
-    """Read the folder `path`: `events.txt`, else the only `events*.txt` (or name the file itself).
+    """Read events in DAVIS text, as the event camera data set has them.
 
     Time 0 is the first event's timestamp. `calib.txt` is fx fy cx cy k1 k2 p1 p2 k3; the sensor is as large
-    as the images, else `size` (width, height), else as `event_beside.with_camera` says. `groundtruth.txt` has
-    T_world_cam as `t tx ty tz qx qy qz qw`, given as it is, before and after the events too.
+    as the images, else `size`, else as `sidecar.with_camera` says. `groundtruth.txt` has T_world_cam as `t tx
+    ty tz qx qy qz qw`, given as it is, before and after the events too.
 
     `frames` are the images of `images.txt` (lines of timestamp and file name) during the events, with the one
     before and the one after; their poses are interpolated, and those without ground truth around them are
-    left out. Their near and far are a guess from how far the camera moves. What was left out or assumed is
-    told in `notes`; `span`, `unit` and what is refused are those of `event_clean.clean`.
+    left out. Their near and far are a guess from how far the camera moves.
+
+    Args:
+        path: The file of events, or a folder with `events.txt`, else a single `events*.txt`.
+        mosaic: The colour of the pixels.
+        size: Width and height of the sensor where no file says.
+        unit: Of the timestamps; by default found out, as a note then says.
+        span: The part to read, two increasing times [s]; by default all.
+
+    Returns:
+        The recording; its notes say what was left out or assumed.
+
+    Raises:
+        DataError: Naming the file, and line or event, for anything that cannot be used (`validate.clean`).
+        ValueError: For another mosaic, and for a span that does not rise.
     """
     source = find(path, size=size)
     folder = source.stream.file.parent
@@ -61,7 +81,18 @@ def load(
 
 
 def find(path: Path | str, *, size: tuple[int, int] | None = None) -> Source:
-    """The file and the camera that `load` reads."""
+    """The file of events and the camera that `load` reads, before it does.
+
+    Args:
+        path: As `load` takes it.
+        size: Width and height of the sensor where no file says.
+
+    Returns:
+        Where the events are, and the camera that saw them.
+
+    Raises:
+        DataError: Naming the file for anything that cannot be used.
+    """
     path = Path(path)
     file = path if path.is_file() else _only_file(path)
     stream = Stream(file, lambda: _blocks(file), lambda row: f"{file}:{_line_of(file, row)}", "s")

@@ -39,7 +39,14 @@ class _Views(NamedTuple):
 
 
 def detect(path: Path) -> bool:
-    """Whether a folder is a split with events, or a scene with one to train on."""
+    """Whether a folder is a split with events, or a scene with one to train on.
+
+    Args:
+        path: A folder.
+
+    Returns:
+        Whether `load` should read it.
+    """
     return _training(path) is not None
 
 
@@ -51,53 +58,73 @@ def load(
     unit: Unit | None = None,
     span: tuple[float, float] | None = None,
 ) -> EventRecording:
-    """Read the scene folder `path` (its split `train` or `train1`), or the folder of a split with events.
+    """Read a scene of EventNeRF.
 
     View i of n is at i / (n - 1) of the last timestamp, as EventNeRF has it; time 0 is the timestamp 0. Poses
     are camera-to-world in OpenCV's axes; intrinsics are the same in all views, 4x4, or 5x4 with k1 and k2 in
-    the last row, and count from the outer corner of the first pixel. The files do not say whether pixels are
-    coloured: `mosaic` does. The sensor is as large as the images of `rgb/`, else `size` (width, height), else
-    346x260 with a note. The motion is cyclic if the last view is no farther from the first, in position and
-    in angle, than twice the median step between views, of which there are eight or more.
+    the last row, and count from the outer corner of the first pixel. The sensor is as large as the images of
+    `rgb/`, else `size`, else 346x260 with a note. The motion is cyclic if the last view is no farther from
+    the first, in position and in angle, than twice the median step between views, of which there are eight or
+    more.
 
     `held_out` are the images of `test`, else of `validation`, where they are: the scene is in the unit
-    sphere, so it lies within 1 of the cameras' distances from the origin. What was left out or assumed is
-    told in `notes`; `span`, `unit` and what is refused among events are those of `event_clean.clean`, here
-    with all events read. DataError naming the file for anything else that cannot be used.
+    sphere, so it lies within 1 of the cameras' distances from the origin.
+
+    Args:
+        path: The scene folder (its split `train` or `train1`), or the folder of a split with events.
+        mosaic: The colour of the pixels, which the files do not say.
+        size: Width and height of the sensor where no file says.
+        unit: Of the timestamps; by default found out, as a note then says.
+        span: The part to read, two increasing times [s]; by default all.
+
+    Returns:
+        The recording; its notes say what was left out or assumed.
+
+    Raises:
+        DataError: Naming the file, and line or event, for anything that cannot be used (`validate.clean`).
+        ValueError: For another mosaic, and for a span that does not rise.
     """
     check_mosaic(mosaic)
     split = _split(Path(path))
     views = _read_views(split, size)
     camera = views.camera
     stream = npz_stream(_event_file(split))
-    events, tally, told = clean(stream, (camera.width, camera.height), unit=unit, zero=0)
-    if tally.latest <= 0:
-        raise DataError(f"{stream.file}: expected timestamps from 0 on, got {tally.latest:g} s as the last")
+    events, stats, notes_on_events = clean(stream, (camera.width, camera.height), unit=unit, zero=0)
+    if stats.latest <= 0:
+        raise DataError(f"{stream.file}: expected timestamps from 0 on, got {stats.latest:g} s as the last")
     count = len(views.T_world_cam)
     if count < 2:
         raise DataError(f"{split / 'pose'}: expected at least 2 views, got {count}")
     held_out, lacking = _held_out(split)
     cyclic = _closes(views.T_world_cam)
-    turn = (
-        "the last view is next to the first: taken as cyclic"
-        if cyclic
-        else "the views do not close: not cyclic"
-    )
+    closed = "the last view is next to the first: taken as cyclic"
+    turn = closed if cyclic else "the views do not close: not cyclic"
     return EventRecording(
         name=name_of(split),
         camera=camera,
         mosaic=mosaic,
         events=events if span is None else _within(stream.file, events, span),
-        t=np.arange(count) / (count - 1) * tally.latest,
+        t=np.arange(count) / (count - 1) * stats.latest,
         T_world_cam=views.T_world_cam,
         cyclic=cyclic,
         held_out=held_out,
-        notes=(*views.notes, *told, f"views taken as evenly spaced in time; {turn}", *lacking),
+        notes=(*views.notes, *notes_on_events, f"views taken as evenly spaced in time; {turn}", *lacking),
     )
 
 
 def find(path: Path | str, *, size: tuple[int, int] | None = None) -> Source:
-    """The file and the camera that `load` reads."""
+    """The file of events and the camera that `load` reads, before it does.
+
+    Args:
+        path: As `load` takes it.
+        size: Width and height of the sensor where no file says.
+
+    Returns:
+        Where the events are, and the camera that saw them.
+
+    Raises:
+        DataError: Naming the file for anything that cannot be used.
+    """
     split = _split(Path(path))
     views = _read_views(split, size)
     return Source(npz_stream(_event_file(split)), views.camera, views.notes)

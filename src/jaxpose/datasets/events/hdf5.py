@@ -20,7 +20,14 @@ _OTHERS = ("rectify_map.h5",)  # of DSEC, with no events in it
 
 
 def detect(path: Path) -> bool:
-    """Whether a folder has an HDF5 file, itself or where DSEC puts that of the left camera."""
+    """Whether a folder has an HDF5 file, itself or where DSEC puts that of the left camera.
+
+    Args:
+        path: A folder.
+
+    Returns:
+        Whether `load` should read it.
+    """
     return bool(_files(path))
 
 
@@ -32,14 +39,26 @@ def load(
     unit: Unit | None = None,
     span: tuple[float, float] | None = None,
 ) -> EventRecording:
-    """Read an HDF5 file of DSEC's layout, or the only one in the folder `path` or its `events/left`.
+    """Read events in HDF5, as DSEC has them. Needs h5py and hdf5plugin (extra `hdf5`).
 
-    `events/` has x, y, p and t, t in microseconds, to which `t_offset` is added where there is one; time 0
-    is the first event's timestamp. `ms_to_idx` is not used. Pixels are as recorded, not rectified. In the
-    folder of the file may lie `poses.txt`, T_world_cam in TUM's format on the clock of t + t_offset, and the
-    camera (`event_beside.with_camera`; it also says what `size` is for). What was left out or assumed is told
-    in `notes`; `span`, `unit` and what is refused are those of `event_clean.clean`. Needs h5py and hdf5plugin
-    (extra `hdf5`); DataError without them.
+    `events/` has x, y, p and t, t in microseconds, to which `t_offset` is added where there is one; time 0 is
+    the first event's timestamp. `ms_to_idx` is not used. Pixels are as recorded, not rectified. In the folder
+    of the file may lie `poses.txt`, T_world_cam in TUM's format on the clock of t + t_offset, and the camera
+    (`sidecar.with_camera`).
+
+    Args:
+        path: The file, or a folder with a single one, in it or in its `events/left`.
+        mosaic: The colour of the pixels.
+        size: Width and height of the sensor where no file says.
+        unit: Of the timestamps; by default found out, as a note then says.
+        span: The part to read, two increasing times [s]; by default all.
+
+    Returns:
+        The recording; its notes say what was left out or assumed.
+
+    Raises:
+        DataError: Naming the file, and line or event, for anything that cannot be used (`validate.clean`).
+        ValueError: For another mosaic, and for a span that does not rise.
     """
     source = find(path, size=size)
     ground_truth = source.stream.file.parent / "poses.txt"
@@ -47,7 +66,18 @@ def load(
 
 
 def find(path: Path | str, *, size: tuple[int, int] | None = None) -> Source:
-    """The file and the camera that `load` reads."""
+    """The file of events and the camera that `load` reads, before it does.
+
+    Args:
+        path: As `load` takes it.
+        size: Width and height of the sensor where no file says.
+
+    Returns:
+        Where the events are, and the camera that saw them.
+
+    Raises:
+        DataError: Naming the file for anything that cannot be used.
+    """
     file = _file(Path(path))
     return with_camera(Stream(file, lambda: _blocks(file), lambda row: f"{file}: event {row}", "us"), size)
 

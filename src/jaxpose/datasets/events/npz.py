@@ -21,7 +21,14 @@ _DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, ValueError, KeyError, NotI
 
 
 def detect(path: Path) -> bool:
-    """Whether a folder has an archive with the four arrays."""
+    """Whether a folder has an archive with the four arrays.
+
+    Args:
+        path: A folder.
+
+    Returns:
+        Whether `load` should read it.
+    """
     return any(_names(file) is not None for file in path.glob("*.npz"))
 
 
@@ -33,12 +40,24 @@ def load(
     unit: Unit | None = None,
     span: tuple[float, float] | None = None,
 ) -> EventRecording:
-    """Read an npz file with arrays x, y, t, p (or xs, ys, ts, ps), or the only one in the folder `path`.
+    """Read events in a numpy archive, of arrays x, y, t, p (or xs, ys, ts, ps).
 
     Time 0 is the first event's timestamp. In the same folder may lie `poses.txt`, T_world_cam in TUM's format
-    on the clock of the events, and the camera (`event_beside.with_camera`; it also says what `size` is for).
-    What was left out or assumed is told in `notes`; `span`, `unit` and what is refused are those of
-    `event_clean.clean`.
+    on the clock of the events, and the camera (`sidecar.with_camera`).
+
+    Args:
+        path: The file, or a folder with a single one.
+        mosaic: The colour of the pixels.
+        size: Width and height of the sensor where no file says.
+        unit: Of the timestamps; by default found out, as a note then says.
+        span: The part to read, two increasing times [s]; by default all.
+
+    Returns:
+        The recording; its notes say what was left out or assumed.
+
+    Raises:
+        DataError: Naming the file, and line or event, for anything that cannot be used (`validate.clean`).
+        ValueError: For another mosaic, and for a span that does not rise.
     """
     source = find(path, size=size)
     ground_truth = source.stream.file.parent / "poses.txt"
@@ -46,12 +65,30 @@ def load(
 
 
 def find(path: Path | str, *, size: tuple[int, int] | None = None) -> Source:
-    """The file and the camera that `load` reads."""
+    """The file of events and the camera that `load` reads, before it does.
+
+    Args:
+        path: As `load` takes it.
+        size: Width and height of the sensor where no file says.
+
+    Returns:
+        Where the events are, and the camera that saw them.
+
+    Raises:
+        DataError: Naming the file for anything that cannot be used.
+    """
     return with_camera(npz_stream(_file(Path(path))), size)
 
 
 def npz_stream(file: Path) -> Stream:
-    """The events of an archive, of which no more than a block is in memory; DataError for what is none."""
+    """The events of an archive, of which no more than a block is in memory.
+
+    Args:
+        file: The archive.
+
+    Returns:
+        The stream; it raises DataError for what is no archive of events when it is read.
+    """
     return Stream(file, lambda: _blocks(file), lambda row: f"{file}: event {row}")
 
 

@@ -1,4 +1,4 @@
-"""Any recording of events: which of the layouts a folder or file has, told by its files, and its loader."""
+"""Any recording of events: which of the layouts a folder or file has, by its files, and its loader."""
 
 from pathlib import Path
 from typing import Literal, NamedTuple, Protocol, get_args
@@ -56,7 +56,14 @@ _LAYOUTS: dict[Format, _Layout] = {
 def find_format(path: Path | str) -> Format:
     """The layout of a folder by its files, or of a file by its suffix.
 
-    DataError saying what was expected and what is there.
+    Args:
+        path: The folder or file.
+
+    Returns:
+        The name of the layout.
+
+    Raises:
+        DataError: Saying what was expected and what is there.
     """
     path = Path(path)
     for name in get_args(Format):
@@ -68,7 +75,19 @@ def find_format(path: Path | str) -> Format:
 
 
 def find(path: Path | str, format: Format | None = None, *, size: tuple[int, int] | None = None) -> Source:
-    """The file of events and the camera that `load` reads, before it does."""
+    """The file of events and the camera that `load_events` reads, before it does.
+
+    Args:
+        path: The folder or file.
+        format: The layout; by default the one that `find_format` finds.
+        size: Width and height of the sensor where no file says.
+
+    Returns:
+        Where the events are, and the camera that saw them.
+
+    Raises:
+        DataError: Naming the file for anything that cannot be used.
+    """
     return _LAYOUTS[format or find_format(path)].module.find(path, size=size)
 
 
@@ -81,11 +100,22 @@ def load_events(
     unit: Unit | None = None,
     span: tuple[float, float] | None = None,
 ) -> EventRecording:
-    """Read a recording of events in the layout `format`, or in the one that `find_format` finds.
+    """Read a recording of events in any of the layouts.
 
-    `mosaic` is the colour of the pixels: without it "rggb" for EventNeRF's layout, else "mono". `size`
-    (width, height) is that of the sensor where no file tells it, `unit` that of the timestamps, and `span`
-    [s] the part to read; see the loaders, whose errors these are.
+    Args:
+        path: The folder or file.
+        format: The layout; by default the one that `find_format` finds.
+        mosaic: The colour of the pixels; by default "rggb" for EventNeRF's layout, else "mono".
+        size: Width and height of the sensor where no file says.
+        unit: Of the timestamps; by default found out, as a note then says.
+        span: The part to read, two increasing times [s]; by default all.
+
+    Returns:
+        The recording; its notes say what was left out or assumed.
+
+    Raises:
+        DataError: Naming the file, and line or event, for anything that cannot be used (`validate.clean`).
+        ValueError: For another mosaic, and for a span that does not rise.
     """
     layout = _LAYOUTS[format or find_format(path)]
     return layout.module.load(path, mosaic=mosaic or layout.mosaic, size=size, unit=unit, span=span)

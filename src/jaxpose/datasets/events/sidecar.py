@@ -42,8 +42,8 @@ def load_source(
     """
     check_mosaic(mosaic)
     stream, camera, assumed = source
-    events, tally, told = clean(stream, (camera.width, camera.height), unit=unit, span=span)
-    zero_s = seconds(tally)
+    events, stats, notes_on_events = clean(stream, (camera.width, camera.height), unit=unit, span=span)
+    zero_s = seconds(stats)
     poses, lacking = _read_truth(ground_truth, zero_s, (float(events.t[0]), float(events.t[-1])))
     recording = EventRecording(
         name=name_of(ground_truth.parent),
@@ -52,7 +52,7 @@ def load_source(
         events=events,
         t=poses.t,
         T_world_cam=poses.T,
-        notes=(*assumed, *told, *lacking),
+        notes=(*assumed, *notes_on_events, *lacking),
     )
     return recording, zero_s
 
@@ -66,8 +66,8 @@ def check_mosaic(mosaic: str) -> None:
 def with_camera(stream: Stream, size: tuple[int, int] | None) -> Source:
     """A stream and the camera of `camera.json` or `calib.txt` in its folder.
 
-    `camera.json` is a run's (`io_camera`). `calib.txt` is the event camera data set's, `fx fy cx cy k1 k2 p1
-    p2 k3`, with the lens as OpenCV has it. It does not tell the size: that is `size` (width, height), else
+    `camera.json` is a run's (`files.camera_json`). `calib.txt` is the event camera data set's, `fx fy cx cy
+    k1 k2 p1 p2 k3`, with OpenCV's distortion. It does not have the size: that is `size` (width, height), else
     the smallest of the known sensors that holds 99% of the first events and has cx, cy within 15% of its
     middle. Without both files the focal length is taken to be as long as the sensor is wide.
 

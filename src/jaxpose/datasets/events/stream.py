@@ -57,21 +57,21 @@ def stream_stats(
     stream: Stream, size: tuple[int, int], unit: Unit | None, zero: int | None
 ) -> Iterator[tuple[StreamStats, Block]]:
     """Blocks with t in seconds (float64), and what was counted up to and with each."""
-    tally, seen = None, 0
+    stats, seen = None, 0
     for block in stream.blocks():
         if not len(block.t):
             continue
         _check_numbers(stream, block, seen)
         block = block._replace(t=block.t.astype(np.float64 if block.t.dtype.kind == "f" else np.int64))
-        if tally is None:
+        if stats is None:
             first = zero if zero is not None else block.t[0].item()
-            tally = StreamStats(unit or _possible(block.t, stream.unit) or find_unit(block.t), first)
+            stats = StreamStats(unit or _possible(block.t, stream.unit) or find_unit(block.t), first)
         # Integers as integers: float64 has not the digits for nanoseconds since 1970.
-        t = (block.t - block.t.dtype.type(tally.zero)).astype(np.float64) / _PER_SECOND[tally.unit]
+        t = (block.t - block.t.dtype.type(stats.zero)).astype(np.float64) / _PER_SECOND[stats.unit]
         block = block._replace(t=t)
-        tally = _add(tally, block, size, seen)
+        stats = _add(stats, block, size, seen)
         seen += len(t)
-        yield tally, block
+        yield stats, block
 
 
 def count(stream: Stream, size: tuple[int, int], *, most: int) -> StreamStats:
@@ -79,13 +79,13 @@ def count(stream: Stream, size: tuple[int, int], *, most: int) -> StreamStats:
 
     DataError as `clean` for what is no number, NaN, or no event at all; nothing else is refused.
     """
-    tally = None
-    for tally, _ in stream_stats(stream, size, None, None):
-        if tally.count >= most:
+    stats = None
+    for stats, _ in stream_stats(stream, size, None, None):
+        if stats.count >= most:
             break
-    if tally is None:
+    if stats is None:
         raise DataError(f"{stream.file}: expected events, got none")
-    return tally
+    return stats
 
 
 def inside(block: Block, size: tuple[int, int]) -> Bool[np.ndarray, " n"]:
@@ -93,13 +93,13 @@ def inside(block: Block, size: tuple[int, int]) -> Bool[np.ndarray, " n"]:
     return (block.x >= 0) & (block.x < size[0]) & (block.y >= 0) & (block.y < size[1])
 
 
-def reach(tally: StreamStats) -> str:
+def reach(stats: StreamStats) -> str:
     """The pixels that events fall on, in words."""
-    low = f"from {tally.low[0]}, {tally.low[1]} " if min(tally.low) < 0 else "up "
-    return f"{low}to {tally.high[0]}, {tally.high[1]}"
+    low = f"from {stats.low[0]}, {stats.low[1]} " if min(stats.low) < 0 else "up "
+    return f"{low}to {stats.high[0]}, {stats.high[1]}"
 
 
-def listed(polarities: frozenset[float]) -> str:
+def in_words(polarities: frozenset[float]) -> str:
     """Polarities in words."""
     return " and ".join(f"{value:g}" for value in sorted(polarities))
 
@@ -126,35 +126,35 @@ def find_unit(t: np.ndarray) -> Unit:
     return "us" if rate >= 1e-3 else "ns"
 
 
-def seconds(tally: StreamStats) -> float:
+def seconds(stats: StreamStats) -> float:
     """Time 0 on the clock of the file [s]."""
-    return float(tally.zero) / _PER_SECOND[tally.unit]
+    return float(stats.zero) / _PER_SECOND[stats.unit]
 
 
-def _add(tally: StreamStats, block: Block, size: tuple[int, int], seen: int) -> StreamStats:
-    """The tally with one more block, which begins with event `seen`."""
+def _add(stats: StreamStats, block: Block, size: tuple[int, int], seen: int) -> StreamStats:
+    """The stats with one more block, which begins with event `seen`."""
     t, x, y, polarity = block
     # How far each event lies behind the latest of those before it.
-    behind = np.maximum.accumulate(np.concatenate([[tally.latest], t[:-1]])) - t
+    behind = np.maximum.accumulate(np.concatenate([[stats.latest], t[:-1]])) - t
     back = np.flatnonzero(behind > 0)
     known = (polarity == 1) | (polarity == 0) | (polarity == -1)
     values = {float(value) for value in (-1, 0, 1) if (polarity == value).any()}
-    odd = tally.odd
+    odd = stats.odd
     if odd is None and not known.all():
         odd = seen + int(known.argmin())
     values |= {float(value) for value in polarity[~known][:1]}
-    return tally._replace(
-        count=tally.count + len(t),
-        earliest=min(tally.earliest, float(t.min())),
-        latest=max(tally.latest, float(t.max())),
-        low=(min(tally.low[0], int(x.min())), min(tally.low[1], int(y.min()))),
-        high=(max(tally.high[0], int(x.max())), max(tally.high[1], int(y.max()))),
-        outside=tally.outside + int((~inside(block, size)).sum()),
-        polarities=tally.polarities | values,
+    return stats._replace(
+        count=stats.count + len(t),
+        earliest=min(stats.earliest, float(t.min())),
+        latest=max(stats.latest, float(t.max())),
+        low=(min(stats.low[0], int(x.min())), min(stats.low[1], int(y.min()))),
+        high=(max(stats.high[0], int(x.max())), max(stats.high[1], int(y.max()))),
+        outside=stats.outside + int((~inside(block, size)).sum()),
+        polarities=stats.polarities | values,
         odd=odd,
-        back=tally.back + len(back),
-        most_back=max(tally.most_back, float(behind.max())),
-        first_back=seen + int(back[0]) if tally.first_back is None and len(back) else tally.first_back,
+        back=stats.back + len(back),
+        most_back=max(stats.most_back, float(behind.max())),
+        first_back=seen + int(back[0]) if stats.first_back is None and len(back) else stats.first_back,
     )
 
 

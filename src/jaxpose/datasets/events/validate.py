@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxpose.datasets.events.stream import Stream, StreamStats, Unit, inside, listed, reach, stream_stats
+from jaxpose.datasets.events.stream import Stream, StreamStats, Unit, in_words, inside, reach, stream_stats
 from jaxpose.errors import DataError
 from jaxpose.events import Events
 
@@ -20,10 +20,10 @@ _MOST_BACK_S = 0.01  # by which one may be (of indices: 1); more is a clock that
 
 
 class Read(NamedTuple):
-    """Events in order, what was counted on the way, and what the user has to know."""
+    """Events in order, what was counted while reading, and notes for the user."""
 
     events: Events
-    tally: StreamStats
+    stats: StreamStats
     notes: tuple[str, ...]
 
 
@@ -48,9 +48,9 @@ def clean(
     no whole numbers, and for no event at all; ValueError for a span that does not rise.
     """
     check_span(span)
-    tally, columns = None, ([], [], [], [])
-    for tally, block in stream_stats(stream, size, unit, zero):
-        if tally.odd is not None:
+    stats, columns = None, ([], [], [], [])
+    for stats, block in stream_stats(stream, size, unit, zero):
+        if stats.odd is not None:
             break
         kept = inside(block, size)
         if span is not None:
@@ -59,18 +59,18 @@ def clean(
             columns, block, (np.float64, np.uint16, np.uint16, np.int8), strict=True
         ):
             column.append(values[kept].astype(kind))
-        if span is not None and tally.latest >= span[1] + _most_back(tally.unit):
+        if span is not None and stats.latest >= span[1] + _most_back(stats.unit):
             break
-    _refuse(stream, size, tally)
-    if tally is None or not any(map(len, columns[0])):
-        raise DataError(f"{stream.file}: expected events, got none" + (_in_words(span) if span else ""))
+    _refuse(stream, size, stats)
+    if stats is None or not any(map(len, columns[0])):
+        raise DataError(f"{stream.file}: expected events, got none" + (_span_in_words(span) if span else ""))
     t, x, y, polarity = (_joined(column) for column in columns)
-    if 0.0 in tally.polarities:
+    if 0.0 in stats.polarities:
         polarity = np.where(polarity == 0, np.int8(-1), polarity)
-    if tally.back:
+    if stats.back:
         order = np.argsort(t, kind="stable")
         t, x, y, polarity = t[order], x[order], y[order], polarity[order]
-    return Read(Events(t, x, y, polarity), tally, _notes(stream, size, unit, tally))
+    return Read(Events(t, x, y, polarity), stats, _notes(stream, size, unit, stats))
 
 
 def check_span(span: tuple[float, float] | None) -> None:
@@ -90,53 +90,53 @@ def _joined(column: list[np.ndarray]) -> np.ndarray:
     return whole
 
 
-def _refuse(stream: Stream, size: tuple[int, int], tally: StreamStats | None) -> None:
+def _refuse(stream: Stream, size: tuple[int, int], stats: StreamStats | None) -> None:
     """DataError for polarities, pixels and an order that cannot be meant."""
-    if tally is None:
+    if stats is None:
         return
     polarities = "polarities 0 and 1, or -1 and 1"
-    if tally.odd is not None:
-        value = max(tally.polarities - {-1.0, 0.0, 1.0})
-        raise DataError(f"{stream.where(tally.odd)}: expected {polarities}, got {value:g}")
-    if {-1.0, 0.0} <= tally.polarities:
-        raise DataError(f"{stream.file}: expected {polarities}, got {listed(tally.polarities)}")
-    if tally.outside > _MOST_OUTSIDE * tally.count:
+    if stats.odd is not None:
+        value = max(stats.polarities - {-1.0, 0.0, 1.0})
+        raise DataError(f"{stream.where(stats.odd)}: expected {polarities}, got {value:g}")
+    if {-1.0, 0.0} <= stats.polarities:
+        raise DataError(f"{stream.file}: expected {polarities}, got {in_words(stats.polarities)}")
+    if stats.outside > _MOST_OUTSIDE * stats.count:
         raise DataError(
-            f"{stream.file}: expected pixels of {size[0]}x{size[1]}, got {tally.outside} of {tally.count} "
-            f"events outside, {reach(tally)}"
+            f"{stream.file}: expected pixels of {size[0]}x{size[1]}, got {stats.outside} of {stats.count} "
+            f"events outside, {reach(stats)}"
         )
-    if tally.back > _MOST_BACK * tally.count or tally.most_back > _most_back(tally.unit):
+    if stats.back > _MOST_BACK * stats.count or stats.most_back > _most_back(stats.unit):
         raise DataError(
-            f"{stream.where(tally.first_back or 0)}: expected events in the order of time, got "
-            f"{tally.back} of {tally.count} earlier than one before, by up to {tally.most_back:.3g} s"
+            f"{stream.where(stats.first_back or 0)}: expected events in the order of time, got "
+            f"{stats.back} of {stats.count} earlier than one before, by up to {stats.most_back:.3g} s"
         )
 
 
-def _notes(stream: Stream, size: tuple[int, int], unit: Unit | None, tally: StreamStats) -> tuple[str, ...]:
+def _notes(stream: Stream, size: tuple[int, int], unit: Unit | None, stats: StreamStats) -> tuple[str, ...]:
     """What was guessed, left out and sorted."""
     notes = []
-    if unit is None and tally.unit != stream.unit:
-        span = tally.latest - tally.earliest
-        note = f"timestamps read as {_WORDS[tally.unit]}"
+    if unit is None and stats.unit != stream.unit:
+        span = stats.latest - stats.earliest
+        note = f"timestamps read as {_WORDS[stats.unit]}"
         if stream.unit is not None:
             note += f", as in the format's {_WORDS[stream.unit]} their rate would be impossible"
-        if tally.unit == "frames":
-            note += f", 1 s each: {tally.count} events in {span:.4g} frames"
+        if stats.unit == "frames":
+            note += f", 1 s each: {stats.count} events in {span:.4g} frames"
         elif span:
-            note += f": {tally.count} events in {span:.4g} s, {tally.count / span:.3g} Hz"
+            note += f": {stats.count} events in {span:.4g} s, {stats.count / span:.3g} Hz"
         notes.append(note)
-    if tally.outside:
+    if stats.outside:
         notes.append(
-            f"{tally.outside} of {tally.count} events left out, outside the sensor of {size[0]}x{size[1]}: "
-            f"{reach(tally)}"
+            f"{stats.outside} of {stats.count} events left out, outside the sensor of {size[0]}x{size[1]}: "
+            f"{reach(stats)}"
         )
-    if tally.back:
+    if stats.back:
         notes.append(
-            f"{tally.back} of {tally.count} events were earlier than one before, by up to "
-            f"{tally.most_back:.3g} s: sorted"
+            f"{stats.back} of {stats.count} events were earlier than one before, by up to "
+            f"{stats.most_back:.3g} s: sorted"
         )
     return tuple(notes)
 
 
-def _in_words(span: tuple[float, float]) -> str:
+def _span_in_words(span: tuple[float, float]) -> str:
     return f" from {span[0]:g} to {span[1]:g} s"

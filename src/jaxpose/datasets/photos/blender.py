@@ -37,9 +37,16 @@ class _Source(NamedTuple):
 
 
 def transforms_file(path: Path | str) -> Path:
-    """The file of training poses: `path` itself, or `transforms_train.json` or `transforms.json` in it.
+    """The file of training poses.
 
-    DataError where there is none.
+    Args:
+        path: The file itself, or a folder with `transforms_train.json` or `transforms.json`.
+
+    Returns:
+        The file.
+
+    Raises:
+        DataError: Where there is none.
     """
     path = Path(path)
     files = (path, path / "transforms_train.json", path / "transforms.json")
@@ -53,17 +60,26 @@ def transforms_file(path: Path | str) -> Path:
 
 
 def load(path: Path | str, *, width: int | None = None) -> tuple[Photographs, Photographs]:
-    """Read a folder (or its json file) of photographs with poses: for training, and held out.
+    """Read photographs with poses: for training, and held out.
 
     Held out is what `transforms_test.json` lists beside `transforms_train.json`, else every 8th image. A
     frame is a file path, with or without suffix, and a camera-to-world pose in OpenGL axes; a frame without
-    its image is skipped and counted in `notes`. All frames share one camera: a focal length (`fl_x`) or an
-    opening angle (`camera_angle_x`), optionally centre, size and OpenCV's lens. Images are resized by area to
-    `width`. Timestamps are the frames' `time` or `timestamp` [s] if each has its own, else frame numbers.
+    its image is skipped and counted in a note. All frames share one camera: a focal length (`fl_x`) or an
+    opening angle (`camera_angle_x`), optionally centre, size and OpenCV's distortion. Timestamps are the
+    frames' `time` or `timestamp` [s] if each has its own, else frame numbers. The depth range is the file's
+    `near` and `far` if it states them, 2 to 6 for Blender's cameras at about 4 from the object, else a guess
+    from where the cameras look, as a note says.
 
-    The depth range is the file's `near` and `far` if it states them, 2 to 6 for Blender's cameras at about 4
-    from the object, else a guess from where the cameras look, which `notes` tells. DataError naming the file
-    for anything that cannot be used; ValueError for a width below 1.
+    Args:
+        path: The folder or its json file.
+        width: Images are resized by area to it [px]; by default they are not.
+
+    Returns:
+        Photographs to train on, and those held out.
+
+    Raises:
+        DataError: Naming the file for anything that cannot be used.
+        ValueError: For a width below 1.
     """
     file = transforms_file(path)
     source = _read(file)

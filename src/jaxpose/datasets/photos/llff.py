@@ -17,17 +17,27 @@ _FARTHEST = 1e8  # [scene units] where BARF's disparity of 1e-8 is
 
 
 def load(path: Path | str, *, width: int | None = None) -> tuple[Photographs, Photographs]:
-    """Read a scene folder: photographs for training, and the last tenth (at least one) held out.
+    """Read a forward-facing scene: photographs for training, and the last tenth (at least one) held out.
 
-    The images are those of the folder `images` or `images_N`: the smallest at least `width` wide, resized by
-    area to it, or the largest without a `width`. They pair in order of name with the rows of
-    `poses_bounds.npy`; each row is a pose with axes down, right, back, the size and focal length of the
-    original image, and the depths of the nearest and farthest point.
+    The images are those of the folder `images` or `images_N`: the smallest at least `width` wide, or the
+    largest without a `width`. They pair in order of name with the rows of `poses_bounds.npy`; each row is a
+    pose with axes down, right, back, the size and focal length of the original image, and the depths of the
+    nearest and farthest point.
 
-    As BARF has it, lengths are scaled so that the nearest depth of all is 4/3, the world is turned and moved
-    into the mean camera (orthonormal here, BARF's only nearly) with axes right, down, forward, and depths
-    run from 1 to infinity in disparity. There are no timestamps: see `notes`. DataError naming the file for
-    anything that cannot be used; ValueError for a width below 1.
+    As BARF has it (Lin et al., ICCV 2021), lengths are scaled so that the nearest depth of all is 4/3, the
+    world is turned and moved into the mean camera (orthonormal here, BARF's only nearly) with axes right,
+    down, forward, and depths run from 1 to infinity in disparity. There are no timestamps, as a note says.
+
+    Args:
+        path: The scene folder.
+        width: Images are resized by area to it [px]; by default they are not.
+
+    Returns:
+        Photographs to train on, and those held out.
+
+    Raises:
+        DataError: Naming the file for anything that cannot be used.
+        ValueError: For a width below 1.
     """
     file = Path(path) / "poses_bounds.npy"
     rows = _read_rows(file)

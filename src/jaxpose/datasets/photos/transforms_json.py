@@ -15,13 +15,18 @@ from jaxpose.geometry.camera import Camera
 
 
 def write_transforms(path: Path | str, photographs: Photographs, *, source: Path | str | None = None) -> None:
-    """Write the poses of `photographs`, camera-to-world in OpenGL axes, with file names as their source has.
+    """Write the poses of photographs, camera-to-world in OpenGL axes, with file names as their source has.
 
-    `source` is the json file they were read from (`data.blender.transforms_file`): all it says is kept, but
-    for the poses and for frames that are not among the photographs, so the result can stand in its place.
-    Without it the camera is written anew: as opening angles, true at any size of the images, if it has no
-    lens and looks through their centre, else as nerfstudio writes it. DataError for poses with NaN or
-    infinity, and for photographs that `source` does not list.
+    Args:
+        path: The json file, written whole or not at all.
+        photographs: Their poses are finite.
+        source: The json file they were read from (`blender.transforms_file`): all it says is kept, but for
+            the poses and for frames that are not among the photographs, so the result can stand in its place.
+            Without it the camera is written anew: as opening angles, true at any size of the images, if it
+            has no distortion and looks through their centre, else as nerfstudio writes it.
+
+    Raises:
+        DataError: For poses with NaN or infinity, and for photographs that `source` does not list.
     """
     finite = np.isfinite(photographs.T_world_cam).all((1, 2))
     if not finite.all():
@@ -33,11 +38,11 @@ def write_transforms(path: Path | str, photographs: Photographs, *, source: Path
         frames = [{"file_path": name} for name in photographs.files]
     else:
         content = json.loads(Path(source).read_text(encoding="utf-8-sig"))
-        listed = {frame["file_path"]: frame for frame in content["frames"]}
+        by_name = {frame["file_path"]: frame for frame in content["frames"]}
         for name in photographs.files:
-            if name not in listed:
+            if name not in by_name:
                 raise DataError(f"{source}: expected a frame of {name}, got none")
-        frames = [listed[name] for name in photographs.files]
+        frames = [by_name[name] for name in photographs.files]
     content["frames"] = [
         {**frame, "transform_matrix": pose} for frame, pose in zip(frames, poses, strict=True)
     ]

@@ -82,23 +82,37 @@ class _Depth(NamedTuple):
 
 
 def detect(path: Path) -> bool:
-    """Whether a folder has the layout's folders."""
+    """Whether a folder has one of the layout's folders.
+
+    Args:
+        path: A folder.
+
+    Returns:
+        Whether `load` should read it.
+    """
     return any((path / name).is_dir() for name in ("mav0", "cam0", "imu0"))
 
 
 def load(path: Path | str) -> Recording:
-    """Read the sequence folder `path` (or its `mav0`) as frames of cam0 with depth, ground truth and IMU.
+    """Read a sequence as frames of cam0 with depth, ground truth and IMU.
 
     Depth is that of `mav0/depth0`, in the layout of a camera (`data.csv` with timestamp and file name,
-    `data/`): 16-bit png in mm, registered to cam0 with its lens, and of the same timestamps. Else it is that
-    of the Vicon room's scan, `mav0/pointcloud0/data.ply` or `data.ply` in the sequence folder, points in the
-    frame of the ground truth, projected into cam0 when a frame is read (`data.cloud`). Images are grey: three
-    equal channels.
+    `data/`): 16-bit png in mm, registered to cam0 with its distortion, and of the same timestamps. Else it is
+    that of the Vicon room's scan, `mav0/pointcloud0/data.ply` or `data.ply` in the sequence folder, points in
+    the frame of the ground truth, projected into cam0 when a frame is read (`cloud_depth`). Images are grey:
+    three equal channels. The ground truth is interpolated to the images' timestamps (cubic splines and slerp,
+    within gaps of 0.1 s) and NaN beyond. The body is the IMU, whose readings are as recorded, biases
+    included.
 
-    The ground truth is interpolated to the images' timestamps (cubic splines and slerp, within gaps of 0.1 s)
-    and NaN beyond. The body is the IMU, whose readings are as recorded, biases included, on the frames'
-    clock. Frames without depth are left out, as `notes` tells. DataError naming the file for anything that
-    cannot be used.
+    Args:
+        path: The sequence folder, or its `mav0`.
+
+    Returns:
+        The frames that have depth, on a clock that starts at the first of them; its notes say what was left
+        out.
+
+    Raises:
+        DataError: Naming the file for anything that cannot be used.
     """
     mav0 = sensors(path)
     cam0 = load_camera(mav0)
@@ -131,7 +145,18 @@ def load(path: Path | str) -> Recording:
 
 
 def load_camera(path: Path | str, name: str = "cam0") -> CameraLog:
-    """Read `mav0/<name>` of the sequence folder `path`: all images are there and of the stated size."""
+    """Read a camera of a sequence: all images are there and of the stated size.
+
+    Args:
+        path: The sequence folder, or its `mav0`.
+        name: The camera's folder in it.
+
+    Returns:
+        Its images and data sheet.
+
+    Raises:
+        DataError: For files that cannot be used.
+    """
     folder = sensors(path) / name
     timestamps, files = read_listing(folder)
     camera, T_body_cam = read_camera_sheet(folder / "sensor.yaml")

@@ -46,24 +46,40 @@ class _Stated(NamedTuple):
 
 
 def detect(path: Path) -> bool:
-    """Whether a folder has one of the layout's two folders."""
+    """Whether a folder has one of the layout's two folders.
+
+    Args:
+        path: A folder.
+
+    Returns:
+        Whether `load` should read it.
+    """
     return (path / "color").is_dir() or (path / "depth").is_dir()
 
 
 def load(path: Path | str, *, rate_hz: float = 30.0, depth_per_metre: float | None = None) -> Recording:
-    """Read the folder `path`: `color/` and `depth/` with png or jpg images, in the order of their numbers.
+    """Read a plain folder: `color/` and `depth/` with png or jpg images, in the order of their numbers.
 
     They are paired by equal names, or in order if no names are equal and there are as many of both.
     Intrinsics are those of `camera-intrinsics.txt` (3x3) or `intrinsics.json` (fx fy cx cy, and optional
-    width height depth_scale), in the folder or one up. Depth is registered to colour, 16 bits; counts per
-    metre are `depth_per_metre`, else the file's depth_scale, else 1000.
+    width height depth_scale), in the folder or one up. Depth is registered to colour, 16 bits.
 
-    `times.txt` has a timestamp [s] for each colour image; without it their period is 1 / rate_hz. `poses.txt`
-    has a camera-to-world pose for each colour image, of 16 numbers (4x4, NaN where there is none) or KITTI's
-    12, or TUM's lines of 8: these go by their timestamps, within 0.02 s, if there is a `times.txt`, and state
-    the times of as many images if there is none. What was left out or assumed is told in `notes`.
+    `times.txt` has a timestamp [s] for each colour image. `poses.txt` has a camera-to-world pose for each
+    colour image, of 16 numbers (4x4, NaN where there is none) or KITTI's 12, or TUM's lines of 8: these go by
+    their timestamps, within 0.02 s, if there is a `times.txt`, and state the times of as many images if there
+    is none.
 
-    DataError naming the file for anything that cannot be used; ValueError for a setting that is not positive.
+    Args:
+        path: The folder.
+        rate_hz: Frames a second where no file has times.
+        depth_per_metre: Counts of depth a metre; by default the file's depth_scale, else 1000.
+
+    Returns:
+        The recording; its notes say what was left out or assumed.
+
+    Raises:
+        DataError: Naming the file for anything that cannot be used.
+        ValueError: For a setting that is not positive.
     """
     if depth_per_metre is not None:
         check_positive("depth_per_metre", depth_per_metre)

@@ -1,4 +1,4 @@
-"""Any recording: which of the layouts a folder has, told by its files, and its loader."""
+"""Any recording: which of the layouts a folder has, by its files, and its loader."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -44,7 +44,17 @@ _LAYOUTS: dict[Format, _Layout] = {
 
 
 def find_format(path: Path | str) -> Format:
-    """The layout of the folder `path`, by its files; DataError saying what was expected and what is there."""
+    """The layout of a folder, by its files.
+
+    Args:
+        path: The folder.
+
+    Returns:
+        The name of the layout.
+
+    Raises:
+        DataError: Saying what was expected and what is there.
+    """
     path = Path(path)
     if path.is_dir():
         for name in get_args(Format):
@@ -74,8 +84,18 @@ def has_timestamps(path: Path | str, format: Format) -> bool:
 
 
 def load_recording(path: Path | str, format: Format | None = None, *, rate_hz: float = 30.0) -> Recording:
-    """Read a recording in the layout `format`, or in the one that `find_format` finds.
+    """Read an RGB-D recording in any of the layouts.
 
-    `rate_hz` is the frame rate where a layout has no timestamps. Errors as those of the loader.
+    Args:
+        path: The folder.
+        format: The layout; by default the one that `find_format` finds.
+        rate_hz: Frames a second where a layout has no timestamps.
+
+    Returns:
+        The recording; images are read when asked for.
+
+    Raises:
+        DataError: Naming the file for anything that cannot be used.
+        ValueError: For a rate that is not positive.
     """
     return _LAYOUTS[format or find_format(path)].load(path, rate_hz)

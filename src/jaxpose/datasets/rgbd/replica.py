@@ -44,20 +44,36 @@ class _Parameters(NamedTuple):
 
 
 def detect(path: Path) -> bool:
-    """Whether a folder has the layout's images or poses."""
+    """Whether a folder has the layout's images or poses.
+
+    Args:
+        path: A folder.
+
+    Returns:
+        Whether `load` should read it.
+    """
     return (path / "results").is_dir() or (path / "traj.txt").is_file()
 
 
 def load(path: Path | str, *, rate_hz: float = 30.0) -> Recording:
-    """Read the scene folder `path`.
+    """Read a scene as NICE-SLAM renders Replica.
 
     Line k of `traj.txt` is the camera-to-world pose of frame k, 16 numbers row by row, axes right, down,
-    forward already (NICE-SLAM turns them to OpenGL's when it reads them). There are no timestamps: frame k is
-    (k - first) / rate_hz seconds after the first. Intrinsics and depth counts per metre are those of
-    `cam_params.json` in the folder or one up, else the published ones, as `notes` says. Depth [m] is 0 where
-    there is none or it is 10 m and more (0 or 65535 counts).
+    forward already (NICE-SLAM turns them to OpenGL's when it reads them). Intrinsics and depth counts per
+    metre are those of `cam_params.json` in the folder or one up, else the published ones, as a note says.
+    Depth [m] is 0 where there is none or it is 10 m and more (0 or 65535 counts).
 
-    DataError naming the file for anything that cannot be used; ValueError for a rate that is not positive.
+    Args:
+        path: The scene folder.
+        rate_hz: Frames a second, as there are no timestamps: frame k is (k - first) / rate_hz seconds after
+            the first.
+
+    Returns:
+        The recording; its notes say what was left out or assumed.
+
+    Raises:
+        DataError: Naming the file for anything that cannot be used.
+        ValueError: For a rate that is not positive.
     """
     folder = Path(path)
     numbers, colors, depths, skipped = _list_frames(folder)
@@ -83,11 +99,11 @@ def _list_frames(folder: Path) -> tuple[list[int], list[Path], list[Path], tuple
     results = folder / "results"
     if not results.is_dir():
         raise DataError(f"{folder}: expected a folder of {_LAYOUT}, got {found(folder)}")
-    listed: dict[str, dict[int, Path]] = {"frame": {}, "depth": {}}
+    files: dict[str, dict[int, Path]] = {"frame": {}, "depth": {}}
     for file in sorted(results.iterdir()):
         if match := _IMAGE.fullmatch(file.name):
-            listed[match[1]][int(match[2])] = file
-    color, depth = listed["frame"], listed["depth"]
+            files[match[1]][int(match[2])] = file
+    color, depth = files["frame"], files["depth"]
     both = sorted(color.keys() & depth.keys())
     lacking = [f"{number:06d}" for number in sorted(color.keys() ^ depth.keys())]
     if not both:

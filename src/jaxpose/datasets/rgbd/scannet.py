@@ -33,20 +33,35 @@ _PUBLISHED_SIZE = (640, 480)
 
 
 def detect(path: Path) -> bool:
-    """Whether a folder has the layout's folders; a plain one has no `pose/`, `intrinsic/` or `frames/`."""
+    """Whether a folder has the layout's folders; a plain one has no `pose/`, `intrinsic/` or `frames/`.
+
+    Args:
+        path: A folder.
+
+    Returns:
+        Whether `load` should read it.
+    """
     exported = any((path / name).is_dir() for name in ("pose", "intrinsic"))
     return (path / "frames" / "color").is_dir() or (exported and (path / "color").is_dir())
 
 
 def load(path: Path | str, *, rate_hz: float = 30.0) -> Recording:
-    """Read the scene folder `path`.
+    """Read a scene as ScanNet's reader exports it.
 
     Colour is resized to the size of depth, whose intrinsics are those of `intrinsic/intrinsic_depth.txt`
     (4x4), else the ones that NICE-SLAM takes for every scene. Depth is in mm. Poses are camera-to-world; one
-    that is missing or holds infinity, as the data set's own lost frames do, is a ground truth of NaN. Frame N
-    is (N - first) / rate_hz seconds after the first. `notes` tells what was left out, resized or assumed.
+    that is missing or holds infinity, as the data set's own lost frames do, is a ground truth of NaN.
 
-    DataError naming the file for anything that cannot be used; ValueError for a rate that is not positive.
+    Args:
+        path: The scene folder.
+        rate_hz: Frames a second: frame N is (N - first) / rate_hz seconds after the first.
+
+    Returns:
+        The recording; its notes say what was left out or assumed.
+
+    Raises:
+        DataError: Naming the file for anything that cannot be used.
+        ValueError: For a rate that is not positive.
     """
     folder = Path(path)
     frames = folder / "frames" if (folder / "frames" / "color").is_dir() else folder

@@ -45,19 +45,34 @@ class _Files(NamedTuple):
 
 
 def detect(path: Path) -> bool:
-    """Whether a folder is a sequence or holds sequences."""
+    """Whether a folder is a sequence or holds sequences.
+
+    Args:
+        path: A folder.
+
+    Returns:
+        Whether `load` should read it.
+    """
     return any(_FRAME.fullmatch(file.name) or file.match("seq-*") for file in path.iterdir())
 
 
 def load(path: Path | str, *, rate_hz: float = 30.0) -> Recording:
-    """Read the sequence folder `path`, or the only `seq-*` in it.
+    """Read a sequence of 7-Scenes.
 
-    The data set has no timestamps: frame number k is (k - first) / rate_hz seconds after the first, so a
-    missing frame leaves its gap. Depth [m] is 0 where the sensor gave none (0 or 65535 mm). Poses are
-    optional: one with NaN or infinity, or missing while others are there, is a ground truth of NaN. What had
-    to be skipped, repaired or assumed is told in `notes`. Images are read when asked for.
+    Depth [m] is 0 where the sensor gave none (0 or 65535 mm). Poses are optional: one with NaN or infinity,
+    or missing while others are there, is a ground truth of NaN. Images are read when asked for.
 
-    DataError naming the file for anything that cannot be used; ValueError for a rate that is not positive.
+    Args:
+        path: The sequence folder, or one that holds a single `seq-*`.
+        rate_hz: Frames a second, as the data set has no timestamps: frame number k is (k - first) / rate_hz
+            seconds after the first, so a missing frame leaves its gap.
+
+    Returns:
+        The recording; its notes say what was left out or assumed.
+
+    Raises:
+        DataError: Naming the file for anything that cannot be used.
+        ValueError: For a rate that is not positive.
     """
     folder = _sequence_folder(Path(path))
     frames, skipped = _list_frames(folder)
@@ -90,13 +105,13 @@ def _sequence_folder(path: Path) -> Path:
 
 def _list_frames(folder: Path) -> tuple[list[_Files], tuple[str, ...]]:
     """Frames that have colour and depth, in order, and a note on those that lack one."""
-    listed: dict[int, dict[str, Path]] = {}
+    by_number: dict[int, dict[str, Path]] = {}
     # Sorted, so that of two colour images of a frame the png, which has lost nothing, comes last and stays.
     for file in sorted(folder.iterdir(), key=lambda file: (file.name.endswith("png"), file.name)):
         if match := _FRAME.fullmatch(file.name):
-            listed.setdefault(int(match[1]), {})[match[2].split(".")[0]] = file
+            by_number.setdefault(int(match[1]), {})[match[2].split(".")[0]] = file
     frames, lacking = [], []
-    for number, files in sorted(listed.items()):
+    for number, files in sorted(by_number.items()):
         missing = [kind for kind in ("color", "depth") if kind not in files]
         if missing:
             lacking.append(f"{number:06d} has no {' and no '.join(missing)}")

@@ -56,24 +56,41 @@ class Stamped(NamedTuple):
 
 
 def detect(path: Path) -> bool:
-    """Whether a folder has one of the layout's lists."""
+    """Whether a folder has one of the layout's lists.
+
+    Args:
+        path: A folder.
+
+    Returns:
+        Whether `load` should read it.
+    """
     return (path / "rgb.txt").is_file() or (path / "depth.txt").is_file()
 
 
 def load(path: Path | str, *, max_difference_s: float = 0.02, depth_per_metre: float = 5000.0) -> Recording:
-    """Read the sequence folder `path`.
+    """Read a sequence of TUM RGB-D.
 
-    Colour and depth are paired one to one, nearest first, if their timestamps are less than
-    `max_difference_s` apart (0.02 s is the data set's own tools'); frames have the timestamps of colour. The
-    true pose is the one nearest in time, NaN where none is that close; without `groundtruth.txt` there is no
-    ground truth, and of lines with one timestamp (the published fr2_desk has two) the first counts.
-    Intrinsics (3x3) are read from `camera-intrinsics.txt` in or beside the folder; else they and the lens are
-    the published ones of freiburg1, 2 or 3, by the folder's name. Depth is registered to colour and stored as
-    `depth_per_metre` counts. `accelerometer.txt` (m/s^2) is the Kinect's own, whose axes are left, up and
-    forward (Microsoft's Kinect documentation, "Accelerometer"): without ground truth it says which way is up.
-    `notes` tells what was left out or assumed, and whether the accelerometer disagrees with the ground truth.
+    Colour and depth are paired one to one, nearest first; frames have the timestamps of colour. The true pose
+    is the one nearest in time, NaN where none is near enough; without `groundtruth.txt` there is no ground
+    truth, and of lines with one timestamp (the published fr2_desk has two) the first counts. Intrinsics (3x3)
+    are read from `camera-intrinsics.txt` in or beside the folder; else they and the distortion are the
+    published ones of freiburg1, 2 or 3, by the folder's name. Depth is registered to colour.
+    `accelerometer.txt` (m/s^2) is the Kinect's own, whose axes are left, up and forward (Microsoft's Kinect
+    documentation, "Accelerometer"): without ground truth it says which way is up; a note says if it disagrees
+    with the ground truth.
 
-    DataError naming the file for anything that cannot be used; ValueError for a setting that is not positive.
+    Args:
+        path: The sequence folder.
+        max_difference_s: Less than this apart [s] are timestamps that belong together; 0.02 s is that of the
+            data set's own tools.
+        depth_per_metre: Counts of depth a metre.
+
+    Returns:
+        The recording; its notes say what was left out or assumed.
+
+    Raises:
+        DataError: Naming the file for anything that cannot be used.
+        ValueError: For a setting that is not positive.
     """
     check_positive("max_difference_s", max_difference_s)
     check_positive("depth_per_metre", depth_per_metre)
@@ -107,7 +124,17 @@ def load(path: Path | str, *, max_difference_s: float = 0.02, depth_per_metre: f
 
 
 def read_list(file: Path) -> Stamped:
-    """Lines of `timestamp name`, names relative to the list, timestamps increasing."""
+    """Read a list of images: lines of `timestamp name`.
+
+    Args:
+        file: Names are relative to its folder, timestamps increase.
+
+    Returns:
+        Timestamps and image files.
+
+    Raises:
+        DataError: Naming file and line for anything else.
+    """
     if not file.is_file():
         raise DataError(f"{file}: expected lines of a timestamp and a file name, got {found(file)}")
     ns, names = read_stamped_names(file, unit="s")

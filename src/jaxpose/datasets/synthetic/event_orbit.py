@@ -1,6 +1,6 @@
 """The events of a camera that circles the object of `orbit`, made on the fly: poses and timestamps are exact.
 
-It stands in for EventNeRF's synthetic turntables (METHOD section 6): one turn, poses at 1000 instants.
+It stands in for EventNeRF's turntables (Rudnev et al., CVPR 2023): one turn, poses at 1000 instants.
 """
 
 from functools import partial
@@ -26,10 +26,21 @@ _HELD_OUT = 10
 def event_orbit(
     width: int = 100, seed: int = 0, *, poses: int = _POSES, mosaic: Mosaic = "rggb"
 ) -> EventRecording:
-    """Events of a sensor of `width` x `width` pixels over one turn, and ten views held out.
+    """Events of a sensor over one turn of the orbit, and ten views held out.
 
-    The sensor sees log intensity, which changes linearly between images rendered at the known poses. The seed
-    turns and tints the texture and draws thresholds and noise. ValueError for fewer than 2 poses or 8 pixels.
+    The sensor sees log intensity, which changes linearly between images rendered at the known poses.
+
+    Args:
+        width: Of the square sensor [px].
+        seed: Turns and tints the texture and draws thresholds and noise.
+        poses: How many are known.
+        mosaic: The colour of the pixels.
+
+    Returns:
+        The recording.
+
+    Raises:
+        ValueError: For fewer than 2 poses or 8 pixels.
     """
     if poses < 2 or width < 8:
         raise ValueError(f"event_orbit: expected at least 2 poses of 8 pixels, got {poses} of {width}")
@@ -46,7 +57,7 @@ def event_orbit(
             yield timestamp, log_intensity((rgb * mask).sum(-1), OFFSET)
 
     events = simulate(
-        images(), THRESHOLD, spread=SPREAD, refractory_s=REFRACTORY_S, noise_hz=NOISE_HZ, seed=seed
+        images(), THRESHOLD, threshold_sigma=SPREAD, refractory_s=REFRACTORY_S, noise_hz=NOISE_HZ, seed=seed
     )
     aside = (np.arange(_HELD_OUT) + 0.25) * orbit.SECONDS / _HELD_OUT
     T_aside = orbit.orbit_poses(aside)

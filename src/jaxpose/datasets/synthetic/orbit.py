@@ -1,6 +1,6 @@
 """An object and the photographs of a camera that circles it, made on the fly: poses and timestamps are exact.
 
-It stands in for the paper's orbit around lego (METHOD section 6): the same path, another object.
+It stands in for the orbit around lego of Ma et al. 2024: the same path, another object.
 """
 
 import math
@@ -26,10 +26,18 @@ _STEPS = 30  # of sphere tracing
 
 
 def orbit(views: int = 100, width: int = 128, seed: int = 0) -> tuple[Photographs, Photographs]:
-    """Photographs (`width` x `width`, white behind) along one turn of a circle that also moves in z.
+    """Photographs, white behind, along one turn of a circle that also moves in z.
 
-    Returns those to train on and ten held-out ones, halfway in time between neighbours. The seed turns and
-    tints the texture; the path is always the same. ValueError for fewer than 2 views or 8 pixels.
+    Args:
+        views: To train on; ten more are held out, halfway in time between neighbours.
+        width: Of the square images [px].
+        seed: Turns and tints the texture; the path is always the same.
+
+    Returns:
+        Photographs to train on, and those held out.
+
+    Raises:
+        ValueError: For fewer than 2 views or 8 pixels.
     """
     if views < 2 or width < 8:
         raise ValueError(f"orbit: expected at least 2 views of 8 pixels, got {views} of {width}")
@@ -52,18 +60,39 @@ def orbit(views: int = 100, width: int = 128, seed: int = 0) -> tuple[Photograph
 
 
 def camera(width: int) -> Camera:
-    """The lens of all views, for images of `width` x `width` pixels."""
+    """The camera of all views.
+
+    Args:
+        width: Of the square images [px].
+
+    Returns:
+        A pinhole.
+    """
     focal = width / 2 / math.tan(math.radians(FIELD_OF_VIEW_DEG / 2))
     return Camera(focal, focal, (width - 1) / 2, (width - 1) / 2, width, width)
 
 
 def paint(seed: int) -> Float[Array, "6"]:
-    """What turns and tints the object's texture."""
+    """What turns and tints the object's texture.
+
+    Args:
+        seed: Makes it.
+
+    Returns:
+        (6,), for `image`.
+    """
     return jnp.asarray(np.random.default_rng(seed).uniform(0, 2 * math.pi, 6), jnp.float32)
 
 
 def orbit_poses(t: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 4 4"]:
-    """Camera-to-world poses at `t` [s]: on the circle, up and down in z, looking at the object's centre."""
+    """Camera-to-world poses on the circle, up and down in z, looking at the object's centre.
+
+    Args:
+        t: Times (n,) [s].
+
+    Returns:
+        (n, 4, 4).
+    """
     angle = 2 * math.pi * t / SECONDS
     centre = np.stack(
         [
@@ -82,7 +111,17 @@ def orbit_poses(t: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 4 4"]:
 def image(
     camera: Camera, T_world_cam: Float[Array, "4 4"], paint: Float[Array, "6"], background: float = 1.0
 ) -> Float[Array, "h w 3"]:
-    """The object from a pose, colours in [0, 1]; every pixel is the mean over a grid of rays in it."""
+    """The object from a pose; every pixel is the mean over a grid of rays in it.
+
+    Args:
+        camera: Of the image.
+        T_world_cam: (4, 4).
+        paint: Of `paint`.
+        background: Grey behind the object, in [0, 1].
+
+    Returns:
+        Colours (h, w, 3) in [0, 1].
+    """
     offsets = (np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5
     x = (np.arange(camera.width)[:, None] + offsets).ravel()
     y = (np.arange(camera.height)[:, None] + offsets).ravel()
@@ -113,7 +152,14 @@ def _trace(
 
 
 def distance(point: Float[Array, "3"]) -> Float[Array, ""]:
-    """Signed distance (a lower bound of it) to the object: cup on a slab, ring, post and three balls."""
+    """Signed distance (a lower bound of it) to the object: cup on a slab, ring, post and three balls.
+
+    Args:
+        point: (3,) in the world.
+
+    Returns:
+        Negative inside.
+    """
     point = point / _SIZE
     x, y, z = point
     slab = _box(point - jnp.asarray([0, 0, -0.75]), jnp.asarray([0.95, 0.7, 0.12])) - 0.04

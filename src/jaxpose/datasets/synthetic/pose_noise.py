@@ -16,12 +16,23 @@ from jaxpose.geometry import rigid
 def correlated(
     t: Float[np.ndarray, " n"], *, translation: float, rotation_deg: float, seed: int, knots: int = 6
 ) -> Float[np.ndarray, "n 4 4"]:
-    """Random deviations at `knots` equally spaced times from first to last, interpolated between them.
+    """Random deviations at equally spaced times, interpolated between them.
 
-    Cubic splines for translation, great arcs (slerp) for rotation. Each is then scaled so that the largest
-    deviation over the views is exactly `translation` [scene units] and `rotation_deg`; 0 gives none at all.
-    Rotation is scaled along its path of rotation vectors, which keeps the path continuous at any angle.
-    ValueError for times all alike, a negative size, an angle above 180 degrees, or fewer than 2 knots.
+    Cubic splines for translation, great arcs (slerp) for rotation. Rotation is scaled along its path of
+    rotation vectors, which keeps the path continuous at any angle.
+
+    Args:
+        t: Times (n,) [s] of the views.
+        translation: The largest deviation over the views is exactly this [scene units]; 0 for none.
+        rotation_deg: The largest turn over the views is exactly this.
+        seed: Makes the deviations.
+        knots: How many times, from the first to the last.
+
+    Returns:
+        T_noise (n, 4, 4).
+
+    Raises:
+        ValueError: For times all alike, a negative size, an angle above 180 degrees, or fewer than 2 knots.
     """
     first, last = float(np.min(t)), float(np.max(t))
     if not last > first:
@@ -42,10 +53,21 @@ def correlated(
 
 
 def independent(n: int, sigma: float, seed: int) -> Float[np.ndarray, "n 4 4"]:
-    """BARF's noise: per view the exponential of a twist of N(0, sigma^2 I_6) [scene units and radians].
+    """BARF's noise (Lin et al., ICCV 2021): per view the exponential of a twist of N(0, sigma^2 I_6).
 
     BARF itself puts it on the world's side of the pose, T_noise . T_true, where turning about the origin also
-    moves the camera. ValueError for a negative sigma.
+    moves the camera.
+
+    Args:
+        n: How many views.
+        sigma: [scene units and rad].
+        seed: Makes the twists.
+
+    Returns:
+        (n, 4, 4).
+
+    Raises:
+        ValueError: For a negative sigma.
     """
     if not 0 <= sigma < math.inf:
         raise ValueError(f"sigma: expected 0 or more, got {sigma}")

@@ -55,7 +55,14 @@ def room(config: RoomConfig = RoomConfig()) -> Recording:
     """A walk through a furnished room, 5 x 4 x 2.6 m; frames are rendered when they are read.
 
     The world is z-up with its origin on the floor; the body is the IMU, its axes forwards, left, up. With
-    `config.along` it is a recorded motion with its readings (`drive.recorded`), the room as large as needed.
+    `config.along` it is a recorded motion with its readings (`trajectory.recorded`), the room as large as
+    needed.
+
+    Args:
+        config: Every random choice follows from its seed.
+
+    Returns:
+        The recording, with ground truth and IMU.
     """
     drive = _drive(config)
     shapes, atlas = scenery(config.seed, drive.room)
