@@ -16,7 +16,6 @@ LONG_FUNCTIONS = {
 }
 # Public functions whose docstring lacks Args or Returns. They go as they get them; nothing is added.
 SILENT = {f"{room}.{name}" for room, names in {
-    "jaxpose": "weighted_mean",
     "slam": "finish load run save",
 }.items() for name in names.split()}  # fmt: skip
 

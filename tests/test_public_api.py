@@ -156,18 +156,64 @@ def test_slam_on_frames_that_come_one_by_one(walk, tracked):
     assert result.field_rmse_m < 0.01
 
 
-def test_a_rolling_shutter_along_a_run(walk, tracked):
-    """Each row is seen from the pose at its own time."""
-    camera, depths, line_s = walk[0], jnp.linspace(0.2, 5.0, 200), 5e-4
-    query = partial(tracked.scene.query, tracked.scene_params)
+def test_a_rolling_shutter_along_a_run(walk, tracked, tmp_path):
+    """Each row is seen from the pose at its own time, by the trajectory that a run leaves."""
+    jaxpose.fields.save(tmp_path / "field.npz", tracked.field, tracked.field_params)
+    field, params = jaxpose.fields.load(tmp_path / "field.npz")
+    depths, query = jnp.linspace(0.2, 5.0, 200), partial(tracked.scene.query, tracked.scene_params)
 
     def see(column, row, t):
-        T = tracked.field.pose(tracked.field_params, t)
-        ray = jaxpose.pixel_ray(camera, T, jnp.stack([column, row]))
+        ray = jaxpose.pixel_ray(walk[0], field.pose(params, t), jnp.stack([column, row]))
         return jaxpose.render_ray(query, ray, depths, weights=jaxpose.surface_weights(0.03)).depth
 
-    columns, rows = jnp.arange(0.0, 80, 8), jnp.arange(0.0, 60, 6)
     image = jax.jit(jax.vmap(jax.vmap(see, (0, None, None)), (None, 0, 0)))
-    rolling, still = image(columns, rows, rows * line_s), image(columns, rows, 0 * rows)
-    assert np.nanmedian(np.abs(still - walk[3][0, ::6, ::8])) < 0.05
-    assert 1e-4 < np.nanmedian(np.abs(rolling - still)) < 0.05
+    columns, rows = jnp.arange(0.0, 80, 8), jnp.arange(0.0, 60, 6)
+    rolling, still = (image(columns, rows, rows * line_s) for line_s in (5e-4, 0))
+    assert np.median(np.abs(still - walk[3][0, ::6, ::8])) < 0.05
+    assert 1e-4 < np.median(np.abs(rolling - still)[1:]) < 0.05 and np.array_equal(rolling[0], still[0])
+
+
+LINE = np.tile(np.eye(4), (5, 1, 1))
+TIMES = np.arange(5.0)
+CAMERA = jaxpose.Camera(50.0, 50.0, 15.5, 11.5, 32, 24)
+RGB, DEPTH = np.zeros((5, 24, 32, 3), np.uint8), np.ones((5, 24, 32), np.float32)
+SPLINE = jaxpose.bspline((0.0, 4.0), 2)
+from_arrays = partial(jaxpose.datasets.from_arrays, CAMERA)
+pixel_ray = partial(jaxpose.pixel_ray, CAMERA)
+
+
+@pytest.mark.parametrize(
+    "call, names",
+    [
+        (lambda: jaxpose.bspline((1.0, 0.0), 3), "first < last .*got span"),
+        (lambda: jaxpose.posenet(jaxpose.PoseNetConfig(layers=0)), "layers >= 1 .*got"),
+        (lambda: jaxpose.per_frame_poses(np.zeros(2)), "times: expected .*"),
+        (lambda: jaxpose.piecewise_geodesic(TIMES, LINE[:4]), r"poses: .*got \(4, 4, 4\)"),
+        (lambda: jaxpose.fit(SPLINE, TIMES[::-1], LINE), "times: expected .*got"),
+        (lambda: jaxpose.fit(SPLINE, TIMES, LINE * np.nan), "poses: expected .*got"),
+        (lambda: SPLINE.pose(jnp.zeros((5, 7)), TIMES), r"t: expected .*got .*\(5,\)"),
+        (lambda: jaxpose.project(CAMERA, jnp.zeros(2)), "point_cam: expected .*got"),
+        (lambda: jaxpose.unproject(CAMERA, jnp.zeros(3)), "pixel: expected .*got"),
+        (lambda: pixel_ray(jnp.eye(4), jnp.zeros((7, 2))), r"pixel: expected .*got \(7, 2\)"),
+        (lambda: pixel_ray(jnp.eye(3), jnp.zeros(2)), r"T_world_cam: expected .*got \(3, 3\)"),
+        (lambda: jaxpose.se3.apply(jnp.eye(4), jnp.zeros(4)), "expected .*got"),
+        (lambda: jaxpose.load_recording("nowhere"), "nowhere: expected .*got"),
+        (lambda: jaxpose.fields.load(__file__), "test_public_api.py: expected a trajectory, got"),
+        (lambda: from_arrays(TIMES, RGB, DEPTH.astype(np.uint16)), "depth: .*got uint16"),
+        (lambda: from_arrays(TIMES, RGB / 255, DEPTH), "rgb: expected .*uint8, got .*float64"),
+        (lambda: from_arrays(TIMES, RGB[:, 1:], DEPTH), r"rgb: .*got \(5, 23, 32, 3\)"),
+        (lambda: from_arrays(TIMES[::-1], RGB, DEPTH), "t: expected .*got"),
+        (lambda: jaxpose.scenes.nerf(jaxpose.scenes.NerfConfig(width=0)), "sizes >= 1 .*got"),
+        (lambda: jaxpose.scenes.image(jaxpose.scenes.ImageConfig(octaves=-1)), "octaves >= 0.*got"),
+        (lambda: jaxpose.scenes.bounding_grid(np.zeros((5, 2))), r"points: expected .*got \(5, 2\)"),
+        (lambda: jaxpose.scenes.GridConfig(voxel=0.0), "voxel > 0 .*got"),
+        (lambda: jaxpose.training.TrainConfig(rays=0), "rays.* >= 1, got"),
+        (lambda: jaxpose.training.Decay(0.0, 1e-3).schedule(10), "Decay: expected first, last > 0 .*got"),
+        (lambda: jaxpose.training.joint(None, None, None, optax.sgd(1.0), 0), "steps: expected .*got 0"),
+        (lambda: jaxpose.training.microbatched_sum(lambda params, x: x, 0), "chunk: expected .*got 0"),
+    ],
+)  # fmt: skip
+def test_input_that_means_nothing_is_named(call, names, unchecked):
+    """Name of the argument, what was expected, what was found; the renderer's are in test_render."""
+    with pytest.raises((ValueError, jaxpose.DataError), match=names):
+        call()

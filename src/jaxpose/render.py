@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from jaxpose._checks import check_shapes
 from jaxpose.geometry.camera import Camera, unproject
 
 Spacing = Literal["depth", "disparity"]
@@ -67,10 +68,14 @@ def pixel_ray(camera: Camera, T_world_cam: Float[Array, "4 4"], pixel: Float[Arr
     Returns:
         The ray in the world. Depth along it is z-depth.
 
+    Raises:
+        ValueError: For a pose that is not (4, 4), and for other than one pixel.
+
     >>> camera = Camera(500.0, 500.0, 320.0, 240.0, 640, 480)
     >>> print(pixel_ray(camera, jnp.eye(4), jnp.array([820.0, 240.0])).direction)
     [1. 0. 1.]
     """
+    check_shapes(T_world_cam=(T_world_cam, "4 4"), pixel=(pixel, "2"))
     direction = jnp.matmul(T_world_cam[:3, :3], unproject(camera, pixel), precision="highest")
     return Ray(T_world_cam[:3, 3], direction)
 

@@ -6,16 +6,16 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxpose import fields
+from jaxpose import fields, optim
 from jaxpose.experiments.planar.task import Photo, Task, corner_errors, pixels
 from jaxpose.experiments.planar.warps import RESET_EVERY, Warps, apply
-from jaxpose.scenes._image import ImageField
+from jaxpose.scenes import ImageField
+from jaxpose.training.steps import Decay, adam
 
 CHUNK = 50  # steps in one compiled call
-_RATE = 1e-3  # Adam's of the image, constant: BARF's
+_IMAGE_RATE = 1e-3  # Adam's, constant: BARF's
 _ROWS = 4096  # points of the image queried at once where it is drawn or measured
 
 OnChunk = Callable[[int, float, float], None]  # steps done, loss, mean corner error [px]
@@ -36,7 +36,7 @@ class Aligned(NamedTuple):
 class _State(NamedTuple):
     image: Any
     pose: Any
-    adam: Any
+    opt_state: Any
     key: PRNGKeyArray
 
 
@@ -56,35 +56,31 @@ def aligner(photo: Photo, image: ImageField, warps: Warps, *, steps: int, points
     `steps` (a multiple of CHUNK) is the length of the run, to which coarse-to-fine window and rates refer.
     """
     grid = pixels(photo)
-    adam = optax.scale_by_adam()
+    pose_rates = jax.tree.map(lambda rate: Decay(rate, rate * warps.decay), warps.rates)
+    optimizer = adam({"image": _IMAGE_RATE, "pose": pose_rates}, steps)
 
     def start(key):
         image_key, pose_key, key = jax.random.split(key, 3)
-        first = image.init(image_key), warps.init(pose_key)
-        return _State(*first, adam.init(first), key)
+        params = {"image": image.init(image_key), "pose": warps.init(pose_key)}
+        return _State(**params, opt_state=optimizer.init(params), key=key)
 
     def loss(params, xy, rgb):
-        image_params, pose_params = params
-        place = jax.vmap(jax.vmap(apply, (None, 0)))(warps.warps(pose_params), xy)
-        return jnp.mean((_query(image, image_params, place) - rgb) ** 2)
+        place = jax.vmap(jax.vmap(apply, (None, 0)))(warps.warps(params["pose"]), xy)
+        return jnp.mean((_query(image, params["image"], place) - rgb) ** 2)
 
     def step(state, number, rgb):
         key, draw_key = jax.random.split(state.key)
         progress = number.astype(rgb.dtype) / steps
-        state = state._replace(image=fields.set_progress(state.image, progress))
+        params = {"image": fields.set_progress(state.image, progress), "pose": state.pose}
         chosen = jax.random.randint(draw_key, (rgb.shape[0], points), 0, rgb.shape[1])
         seen = jnp.take_along_axis(rgb, chosen[..., None], axis=1)
-        params = state.image, state.pose
         value, gradient = jax.value_and_grad(loss)(params, jnp.asarray(grid, rgb.dtype)[chosen], seen)
-        with jax.numpy_dtype_promotion("standard"):  # optax needs it
-            direction, memory = adam.update(gradient, state.adam)
-        rates = _RATE, jax.tree.map(lambda rate: rate * warps.decay**progress, warps.rates)
-        rates = jax.tree.broadcast(rates, params)
-        new_image, pose = jax.tree.map(lambda p, rate, d: p - rate * d, params, rates, direction)
+        params, opt_state = optim.apply(optimizer, params, gradient, state.opt_state)
         if warps.reset is not None:
+            pose = params["pose"]
             smooth = jnp.matmul(jnp.asarray(warps.reset, pose.dtype), pose, precision="highest")
-            pose = jnp.where((number + 1) % RESET_EVERY == 0, smooth, pose)
-        return _State(new_image, pose, memory, key), value
+            params = params | {"pose": jnp.where((number + 1) % RESET_EVERY == 0, smooth, pose)}
+        return _State(**params, opt_state=opt_state, key=key), value
 
     def advance(state, rgb, first):
         numbers = first + jnp.arange(CHUNK)
