@@ -9,7 +9,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxpose import fields
+from jaxpose import fields, optim
 from jaxpose.experiments.planar.task import Photo, Task, corner_errors, pixels
 from jaxpose.experiments.planar.warps import RESET_EVERY, Warps, apply
 from jaxpose.scenes._image import ImageField
@@ -56,7 +56,9 @@ def aligner(photo: Photo, image: ImageField, warps: Warps, *, steps: int, points
     `steps` (a multiple of CHUNK) is the length of the run, to which coarse-to-fine window and rates refer.
     """
     grid = pixels(photo)
-    adam = optax.scale_by_adam()
+    decays = lambda rate: lambda count: rate * warps.decay ** (count.astype(jnp.float32) / steps)
+    rates = optim.scale_by_rates((_RATE, jax.tree.map(decays, warps.rates)))
+    adam = optax.chain(optax.scale_by_adam(), rates)
 
     def start(key):
         image_key, pose_key, key = jax.random.split(key, 3)
@@ -76,11 +78,7 @@ def aligner(photo: Photo, image: ImageField, warps: Warps, *, steps: int, points
         seen = jnp.take_along_axis(rgb, chosen[..., None], axis=1)
         params = state.image, state.pose
         value, gradient = jax.value_and_grad(loss)(params, jnp.asarray(grid, rgb.dtype)[chosen], seen)
-        with jax.numpy_dtype_promotion("standard"):  # optax needs it
-            direction, memory = adam.update(gradient, state.adam)
-        rates = _RATE, jax.tree.map(lambda rate: rate * warps.decay**progress, warps.rates)
-        rates = jax.tree.broadcast(rates, params)
-        new_image, pose = jax.tree.map(lambda p, rate, d: p - rate * d, params, rates, direction)
+        (new_image, pose), memory = optim.apply(adam, params, gradient, state.adam)
         if warps.reset is not None:
             smooth = jnp.matmul(jnp.asarray(warps.reset, pose.dtype), pose, precision="highest")
             pose = jnp.where((number + 1) % RESET_EVERY == 0, smooth, pose)
