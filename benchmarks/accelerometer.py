@@ -16,6 +16,7 @@ import optax
 import tyro
 from timing import in_turn, machine, milliseconds, product_gflops
 
+from jaxpose import optim
 from jaxpose.fields import PoseNetConfig, posenet
 from jaxpose.imu import accelerometer_residual
 
@@ -44,8 +45,7 @@ def make_step(config: Config, trained: tuple[str, ...]):
 
     def step(params, state, fixed):
         loss, gradient = jax.value_and_grad(loss_fn)(params, fixed)
-        updates, state = adam.update(gradient, state)
-        return optax.apply_updates(params, updates), state, loss
+        return *optim.apply(adam, params, gradient, state), loss
 
     params = {name: fixed[name] for name in trained}
     arguments = (params, adam.init(params), fixed)

@@ -18,6 +18,7 @@ import tyro
 from timing import machine
 from tracking import FIELDS, make_loss, room
 
+from jaxpose import optim
 from jaxpose.fields import posenet, project_onto_poses
 from jaxpose.geometry import se3
 from jaxpose.geometry.rigid import rotation_angle
@@ -40,22 +41,20 @@ class Config:
 def make_descent(scene, pose_of, rates, config: Config):
     """The compiled descent `(parameters, scene parameters, image, key) -> poses (iterations, 4, 4)`."""
     loss_fn = make_loss(scene, pose_of, rays=config.rays, even=32, near=16)
-    adam = optax.scale_by_adam()
 
     @jax.jit
     def descent(params, scene_params, image, key, rate):
-        def improve(carry, item):
+        def improve(carry, key):
             params, state = carry
-            key, i = item
             gradient = jax.grad(loss_fn)(params, scene_params, image, key)
-            direction, state = adam.update(gradient, state)
-            fall = rate * TrackConfig().decay ** (i / config.iterations)
-            params = jax.tree.map(lambda p, r, d: p - fall * r * d, params, rates, direction)
+            params, state = optim.apply(adam, params, gradient, state)
             return (params, state), pose_of(params)
 
+        decay = optax.exponential_decay(rate, config.iterations, TrackConfig().decay)
+        schedules = jax.tree.map(lambda r: lambda count: r * decay(count), rates)
+        adam = optax.chain(optax.scale_by_adam(), optim.scale_by_rates(schedules))
         keys = jax.random.split(key, config.iterations)
-        items = (keys, jnp.arange(config.iterations, dtype=jnp.float32))
-        return jax.lax.scan(improve, (params, adam.init(params)), items)[1]
+        return jax.lax.scan(improve, (params, adam.init(params)), keys)[1]
 
     return descent
 

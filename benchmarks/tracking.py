@@ -20,6 +20,7 @@ from jaxpose.datasets.types import Frame
 from jaxpose.fields import PoseNetConfig, posenet
 from jaxpose.geometry import se3
 from jaxpose.geometry.camera import Camera, pixel_grid, unproject_numpy
+from jaxpose.optim import minimize
 from jaxpose.scenes import bounding_grid, grid, node_positions
 from jaxpose.slam.config import SampleConfig, TrackConfig
 from jaxpose.slam.observation import sample_pixels, to_device
@@ -80,15 +81,10 @@ def make_loop(scene, pose_of, config: Config):
 
     @jax.jit
     def loop(params, scene_params, image, key):
-        def improve(carry, key):
-            params, state = carry
-            loss, gradient = jax.value_and_grad(loss_fn)(params, scene_params, image, key)
-            updates, state = adam.update(gradient, state)
-            return (optax.apply_updates(params, updates), state), loss
-
         keys = jax.random.split(key, config.iterations)
-        (params, _), losses = jax.lax.scan(improve, (params, adam.init(params)), keys)
-        return params, losses[-1]
+        loss = lambda params, i: loss_fn(params, scene_params, image, keys[i])
+        found = minimize(loss, params, adam, config.iterations)
+        return found.params, found.loss
 
     return loop
 

@@ -333,16 +333,3 @@ def test_help_all_lists_the_options(capsys):
 def test_defaults():
     assert imu_slam.Config().slam.imu == "combined" and rgbd_slam.Config().slam.imu == "none"
     assert imu_slam.Config().slam == replace(rgbd_slam.Config().slam, imu="combined")
-
-
-def test_readme():
-    text = README.read_text()
-    assert "pip install -e . && python -m jaxpose.experiments.imu_slam\n" in text
-    assert 'pip install -e ".[test]" && pytest\n' in text
-    blocks = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-    assert blocks
-    with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):  # as users have it
-        for block in blocks:
-            exec(compile(block, str(README), "exec"), {})
-    for path in re.findall(r"`(src/jaxpose/[\w/.]*|tests/|experiments/)`", text):
-        assert (README.parent / path).exists(), path

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from jaxpose.geometry.camera import Camera
 from jaxpose.losses import weighted_mean
+from jaxpose.optim import minimize
 from jaxpose.render import Ray, composite, sdf_weights
 from jaxpose.scenes import SceneField
 from jaxpose.scenes.types import Params
@@ -32,7 +33,7 @@ def make_descend(scene: SceneField, camera: Camera, config: MapConfig):
 
     `images` and `T_world_cam` are stacked over the window. The number of iterations is traced.
     """
-    adam = optax.scale_by_adam(b2=0.99)
+    adam = lambda rate: optax.chain(optax.scale_by_adam(b2=0.99), optax.scale(-rate))
     share = config.pixels // config.window
 
     def loss_fn(params, images, T_world_cam, far, key):
@@ -72,19 +73,11 @@ def make_descend(scene: SceneField, camera: Camera, config: MapConfig):
         iterations: Int[Array, ""],
         key: PRNGKeyArray,
     ) -> tuple[MapState, Float[Array, ""]]:
-        def improve(i, carry):
-            (params, opt_state), _ = carry
-            loss, gradient = jax.value_and_grad(loss_fn)(
-                params, images, T_world_cam, far, jax.random.fold_in(key, i)
-            )
-            with jax.numpy_dtype_promotion("standard"):
-                direction, opt_state = adam.update(gradient, opt_state)
-            params = jax.tree.map(lambda p, d: p - rate * d, params, direction)
-            return MapState(params, opt_state), loss
-
-        return jax.lax.fori_loop(0, iterations, improve, (state, jnp.zeros(())))
+        loss = lambda params, i: loss_fn(params, images, T_world_cam, far, jax.random.fold_in(key, i))
+        found = minimize(loss, state.params, adam(rate), iterations, state=state.fusion_state)
+        return MapState(found.params, found.state), found.loss
 
     def init(params: Params) -> MapState:
-        return MapState(params, adam.init(params))
+        return MapState(params, adam(0.0).init(params))
 
     return init, update

@@ -18,6 +18,7 @@ from jaxpose.fields.intrinsic_motion import dof_loss
 from jaxpose.geometry import se3
 from jaxpose.geometry.camera import Camera, angle_of_view
 from jaxpose.losses import weighted_mean
+from jaxpose.optim import minimize, scale_by_rates
 from jaxpose.render import Query
 from jaxpose.scenes import SceneField
 from jaxpose.slam.config import ImuWeights, TrackConfig
@@ -142,29 +143,10 @@ def _descend(objective, params, config: TrackConfig, iterations: int, patience: 
     running means too: pixels differ from one iteration to the next.
     """
     rates = _rates(params, {"translation": config.learning_rate, "rotation": config.rotation_rate})
-    adam = optax.scale_by_adam()
-
-    def improve(carry):
-        params, state, mean, seen, best, best_at, i = carry
-        (loss, now), gradient = jax.value_and_grad(objective, has_aux=True)(params, i)
-        with jax.numpy_dtype_promotion("standard"):  # optax needs it
-            direction, state = adam.update(gradient, state)
-        fall = config.decay ** (i.astype(jnp.float32) / iterations)
-        params = jax.tree.map(lambda p, rate, d: p - rate * fall * d, params, rates, direction)
-        keep = jnp.where(i == 0, 0.0, 0.8)
-        mean, seen = keep * mean + (1 - keep) * loss, keep * seen + (1 - keep) * now
-        lower = mean < best * (1 - 1e-3)
-        best, best_at = jnp.where(lower, mean, best), jnp.where(lower, i, best_at)
-        return params, state, mean, seen, best, best_at, i + 1
-
-    def unsettled(carry):
-        *_, best_at, i = carry
-        return (i < iterations) & (i - best_at <= patience)
-
-    zero = jnp.zeros(jax.eval_shape(objective, params, jnp.int32(0))[1].shape)
-    start = (params, adam.init(params), jnp.zeros(()), zero, jnp.inf, jnp.int32(0), jnp.int32(0))
-    params, _, _, seen, *_, i = jax.lax.while_loop(unsettled, improve, start)
-    return (params, seen), i
+    decays = lambda rate: lambda i: rate * config.decay ** (i.astype(jnp.float32) / iterations)
+    tx = optax.chain(optax.scale_by_adam(), scale_by_rates(jax.tree.map(decays, rates)))
+    found = minimize(objective, params, tx, iterations, has_aux=True, smoothing=0.8, patience=patience)
+    return (found.params, found.aux), found.steps
 
 
 def _rates(params, rates):

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 from jaxpose.fields import Params, PoseField, project_onto_poses
 from jaxpose.fields.intrinsic_motion import dof_loss, outer_loss
 from jaxpose.geometry import se3
+from jaxpose.optim import minimize
 
 EVERY = 10  # frames
 _STEPS = 400
@@ -33,7 +34,7 @@ def make_refit(outer: PoseField, inner: PoseField, angle_of_view: float) -> Refi
     `params` are those of `fields.intrinsic`, `T` (k, 4, 4) the motions of the frames at `t` [s] since the
     frame before each.
     """
-    adam = optax.scale_by_adam()
+    adam = optax.adam(optax.exponential_decay(_RATE, _STEPS, _DECAY))
 
     def loss(params, t, T):
         T_outer = jax.vmap(partial(outer.pose, params))(t)
@@ -42,16 +43,7 @@ def make_refit(outer: PoseField, inner: PoseField, angle_of_view: float) -> Refi
 
     @jax.jit
     def refit(params, t, T):
-        def improve(i, carry):
-            params, state = carry
-            gradient = jax.grad(loss)(params, t, T)
-            with jax.numpy_dtype_promotion("standard"):  # optax needs it
-                direction, state = adam.update(gradient, state)
-            rate = _RATE * _DECAY ** (i.astype(jnp.float32) / _STEPS)
-            return jax.tree.map(lambda p, d: p - rate * d, params, direction), state
-
-        start = (params["outer"], adam.init(params["outer"]))
-        found, _ = jax.lax.fori_loop(0, _STEPS, improve, start)
+        found = minimize(lambda outer, _: loss(outer, t, T), params["outer"], adam, _STEPS).params
         T_outer = jax.vmap(partial(outer.pose, found))(t)
         T_inner = se3.compose(se3.inverse(T_outer), T)
         recent = lambda p: jax.vmap(partial(inner.pose, p))(t[-_RECENT:])
