@@ -149,7 +149,7 @@ def test_a_start_inside_a_surface_is_finite(dtype):
         )
         return seen.depth + seen.variance + seen.opacity
 
-    value, gradient = jax.value_and_grad(total)(jnp.zeros((), dtype))
+    value, gradient = jax.jit(jax.value_and_grad(total))(jnp.zeros((), dtype))
     assert np.isfinite(value) and np.isfinite(gradient)
 
 

@@ -30,6 +30,7 @@ def live(walk, config, start, **first):
     return states
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("imu", "start"), [("none", 1.7e9), ("combined", 0.0)])
 def test_frames_one_by_one_end_where_a_recording_does(walk, imu, start):
     config = SlamConfig(imu=imu, voxel=0.05)
