@@ -8,8 +8,6 @@ from numpy.testing import assert_allclose
 
 from jaxpose.losses import weighted_mean
 
-pytestmark = pytest.mark.optimised
-
 
 def test_it_is_numpys_weighted_average(dtype):
     rng = np.random.default_rng(0)

@@ -8,8 +8,6 @@ from numpy.testing import assert_allclose
 
 from jaxpose import nn
 
-pytestmark = pytest.mark.optimised
-
 
 def numpy_mlp(params, x, skip, activation):
     """The perceptron in float64, with no code in common."""

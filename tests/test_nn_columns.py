@@ -11,8 +11,6 @@ from numpy.testing import assert_allclose
 from jaxpose import nn, nn_columns
 from jaxpose.nn_columns import dense, frequency_encoding, product, spread
 
-pytestmark = pytest.mark.optimised
-
 TOLERANCE = {jnp.float32: 3e-5, jnp.float64: 1e-12}
 # Axes of the vmaps, inner ones first, with the shape of what each mapped argument gains.
 RNG = np.random.default_rng(0)

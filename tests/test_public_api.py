@@ -135,6 +135,7 @@ def tracked(walk):
     return jaxpose.slam.run(recording, jaxpose.slam.SlamConfig(voxel=0.05))
 
 
+@pytest.mark.slow
 def test_slam_from_arrays(walk, tracked):
     """Poses since the first one, and a continuous trajectory through them."""
     *_, T_true = walk
@@ -146,6 +147,7 @@ def test_slam_from_arrays(walk, tracked):
     assert np.abs(between - tracked.T_world_cam[5]).max() < 0.01
 
 
+@pytest.mark.slow
 def test_slam_on_frames_that_come_one_by_one(walk, tracked):
     camera, times, colours, depths, _ = walk
     state = jaxpose.slam.init(camera, jaxpose.slam.SlamConfig(voxel=0.05))

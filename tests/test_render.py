@@ -23,8 +23,6 @@ from jaxpose.render import (
     surface_weights,
 )
 
-pytestmark = pytest.mark.optimised
-
 RTOL = {jnp.float32: 2e-5, jnp.float64: 1e-11}
 WIDTH = 0.02  # [m] of rendered surfaces
 WALL_Z, TILT = 2.0, np.array([0.3, -0.2, -1.0])  # a wall through (0, 0, WALL_Z), seen at an angle
@@ -286,6 +284,7 @@ def opaque(distance):
     return jnp.where(distance > 0.1, 0, jnp.where(distance < -0.1, 1, 0.5 - 5 * distance))
 
 
+@pytest.mark.optimised
 @pytest.mark.parametrize(
     ("weights", "geometry"),
     [

@@ -9,8 +9,6 @@ from helpers.distortion import pixel_of, ray_of
 from jaxpose.geometry import camera
 from jaxpose.geometry.camera import Camera
 
-pytestmark = pytest.mark.optimised
-
 PINHOLE = Camera(500.0, 480.0, 319.5, 239.5, 640, 480)
 EUROC = Camera(
     458.654, 457.296, 367.215, 248.375, 752, 480, (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05)

@@ -6,6 +6,7 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from helpers.blocks import node_positions, over_box
 from helpers.wall import CAMERA, wall
 from numpy.testing import assert_allclose, assert_array_equal
@@ -185,6 +186,8 @@ def test_nothing_is_compiled_anew_while_the_map_grows():
     assert update._cache_size() == 1
 
 
+@pytest.mark.slow
+@pytest.mark.optimised
 def test_the_gradient_finds_the_same_wall_and_compiles_once():
     config = GridConfig((-0.4, -0.4, 1.2), (0.4, 0.4, 2.4), voxel=0.05, levels=2, truncation=BAND)
     scene = grid(config)

@@ -56,7 +56,8 @@ def test_a_killed_run_goes_on_and_ends_as_if_nothing_had_been(tmp_path):
     assert (tmp_path / "killed" / "results.json").stat().st_mtime_ns == before
 
 
-@pytest.mark.parametrize("method", ["fused", pytest.param("gradient", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["fused", "gradient"])
 def test_a_checkpoint_holds_the_whole_state(method, tmp_path):
     options = rgbd_slam.Config(smoke=True, slam=SlamConfig(voxel=0.2, map=MapConfig(method=method)))
     recording, config = load(options).recording, slam_config(options)
