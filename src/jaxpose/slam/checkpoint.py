@@ -16,6 +16,7 @@ from jaxpose.scenes.voxel_blocks import BlockConfig, packed, unpacked
 from jaxpose.slam.config import SlamConfig
 from jaxpose.slam.map.backend import map_backend
 from jaxpose.slam.pipeline import begin
+from jaxpose.slam.tracking.features import detect
 from jaxpose.slam.types import SlamState, no_frames
 
 
@@ -55,6 +56,11 @@ def load(path: Path | str, recording: Recording, config: SlamConfig) -> SlamStat
         )
     if isinstance(grid, BlockConfig):
         state = state._replace(map=state.map._replace(params=unpacked(grid, *state.map.params)))
+    keyframes = np.flatnonzero(state.frames.keyframe)
+    corners = lambda i: detect(recording.read(int(i)), recording.camera)
+    if config.uses_features:
+        last = state.frames.count - 1
+        state = state._replace(features=corners(last), keyframe_features=tuple(map(corners, keyframes)))
     return state._replace(
         config=config,
         grid=grid,
@@ -72,7 +78,8 @@ def _as_arrays(state: SlamState, size: dict[str, Any], blocks: int | None = None
     assert state.map is not None
     numbers = {name: np.asarray(getattr(state, name)) for name in ("max_depth", "duration_s")}
     motion = state.motion._replace(gyro_bias_sigma=np.asarray(state.motion.gyro_bias_sigma))
-    state = state._replace(**numbers, motion=motion, camera=None, config=None, grid=None, images=())
+    state = state._replace(**numbers, motion=motion, camera=None, config=None, grid=None)
+    state = state._replace(features=None, keyframe_features=(), images=())  # the recording gives them again
     if state.map is not None and hasattr(state.map.params, "table"):
         rows = packed(state.map.params)
         if blocks is not None:

@@ -107,6 +107,7 @@ class RecoveryConfig:
     """
 
     held: float = 0.08  # [m, rad] a prediction from the IMU that cannot be off by more is as good as no loss
+    held_by_features: float = 0.05  # [m, rad] a pose known as well by features is not lost, whatever the map says
     farthest: float = 0.5  # [m, rad] a search reaches no farther around a prediction; then anywhere
     around_keyframes: float = 0.25  # [m, rad] a search reaches around keyframes where nothing else is known
     recognised_valid: float = 0.7  # after a loss, of a camera that could be anywhere: share explained,
@@ -139,6 +140,8 @@ class SlamConfig:
     imu: ImuMode = "none"
     # What the output of the field is relative to; all but anchored, which is ours, are the paper's (table 9).
     frame: FrameName = "anchored"
+    # Sparse features as a second opinion on the motion (`gauss_newton` only): ORB by OpenCV, or none.
+    features: Literal["orb", "none"] = "orb"
     seed: int = 0  # of the network's start, the pixels drawn, the noise of a simulated IMU
     field: PoseNetConfig = PoseNetConfig(layers=4, width=128, activation="softplus")
     track: TrackConfig = TrackConfig()
@@ -165,6 +168,11 @@ class SlamConfig:
     def uses_accelerometer(self) -> bool:
         """Whether the accelerometer carries the speed from one frame to the next."""
         return self.imu in ("accelerometer", "combined")
+
+    @property
+    def uses_features(self) -> bool:
+        """Whether poses are predicted by sparse features; the paper's own way of tracking has none."""
+        return self.features != "none" and self.track.method == "gauss_newton"
 
     @property
     def uses_field(self) -> bool:

@@ -34,11 +34,13 @@ from jaxpose.slam.map.backend import (
 from jaxpose.slam.map.texture import Texture, make_texture, textured
 from jaxpose.slam.observation import is_blank, to_device
 from jaxpose.slam.tracker import next_pose
+from jaxpose.slam.tracking.features import detect
 from jaxpose.slam.tracking.intrinsic_frame import is_due, make_refit, window
 from jaxpose.slam.tracking.predict import GYRO_BIAS_SIGMA
 from jaxpose.slam.types import Frames, Motion, SlamState, no_frames
 
 _DEFAULT = SlamConfig()
+_VIEW_CHANGE = 0.1  # of the angle of view, after which a frame is mapped
 _KEPT_S = 0.1  # of readings before the last frame, so that they can be interpolated there
 
 
@@ -115,6 +117,8 @@ def init(
         exposure=np.ones(3, np.float32),
         max_depth=0.0,
         thumbnails=np.zeros((0, 2, 12, 16)),
+        features=None,
+        keyframe_features=(),
         images=(),
         grid=None,
         map=None,
@@ -245,7 +249,9 @@ def _advance(state: SlamState, frame: Frame, t: float, imu: Imu | None, read: Fr
     track_key, map_key = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), i))
     state = state._replace(frames=state.frames.appended(t), imu=_joined(state, imu))
     image = to_device(frame)._replace(exposure=state.exposure)
-    state = next_pose(state, frame, image, generator, track_key) if i else _first_pose(state)
+    features = detect(frame, state.camera) if config.uses_features else None
+    state = next_pose(state, frame, image, features, generator, track_key) if i else _first_pose(state)
+    state = state._replace(features=features)
     if config.frame == "intrinsic" and is_due(i):
         state = _update_intrinsic_frame(state)
     T_world_cam = state.frames.T_world_body[i] @ state.T_body_cam
@@ -261,6 +267,8 @@ def _advance(state: SlamState, frame: Frame, t: float, imu: Imu | None, read: Fr
     state = map_frame(state, image, points, read, generator, map_key)
     if state.frames.keyframe[i]:
         state = state._replace(thumbnails=np.concatenate([state.thumbnails, thumbnail(frame)[None]]))
+        if features is not None:
+            state = state._replace(keyframe_features=(*state.keyframe_features, features))
     return state
 
 
@@ -282,8 +290,17 @@ def _is_mapped(state: SlamState, frame: Frame) -> bool:
     if held_out or frames.doubted[i] or not len(mapped):
         return not held_out and not frames.doubted[i]
     unconfirmed = frames.lost[i - 1] and not config.uses_accelerometer
-    passed = frames.t[i] - frames.t[mapped[-1]]
-    return bool(not unconfirmed and not is_blank(frame) and passed >= config.map_every_s)
+    last = mapped[-1]
+    due = frames.t[i] - frames.t[last] >= config.map_every_s or _view_changed(state, frame, last)
+    return bool(not unconfirmed and not is_blank(frame) and due)
+
+
+def _view_changed(state: SlamState, frame: Frame, since: int) -> bool:
+    """Whether the image has moved by a tenth of its view since a frame, whatever the clock says."""
+    away = rigid.inverse(state.frames.T_world_body[since]) @ state.frames.T_world_body[-1]
+    near = float(np.median(frame.depth[frame.depth > 0]))
+    moved = np.linalg.norm(away[:3, 3]) / near + rigid.rotation_angle(np.eye(3), away[:3, :3])
+    return bool(moved > _VIEW_CHANGE * angle_of_view(state.camera)[0])
 
 
 def _update_intrinsic_frame(state: SlamState) -> SlamState:

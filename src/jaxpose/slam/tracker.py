@@ -13,6 +13,7 @@ from jaxpose.slam.config import RecoveryConfig
 from jaxpose.slam.keyframes import thumbnail
 from jaxpose.slam.map.backend import map_backend, scene_params
 from jaxpose.slam.observation import Image, is_blank
+from jaxpose.slam.tracking.features import FeaturePose, Features, locate_camera
 from jaxpose.slam.tracking.predict import (
     BEHIND,
     PreintegratedImu,
@@ -30,6 +31,11 @@ from jaxpose.slam.tracking.register import Tracked
 from jaxpose.slam.tracking.relocalise import CENTRES, FOUND_SIGMA
 from jaxpose.slam.types import Frames, Motion, SlamState, TrackingStatus
 
+_USUAL = 30  # frames that say what is usual
+_MATCHED = 3  # images that a frame's features are matched with
+_FIRST_SCALE = 30.0  # of the covariance of poses by features, before any has been compared: measured 6 to 200
+_CHI2_MEDIAN, _CHI2_999 = 5.35, 22.46  # of 6 degrees of freedom
+
 
 class MotionPrediction(NamedTuple):
     """What is expected of the motion since the last frame, before this frame's image is looked at."""
@@ -37,26 +43,42 @@ class MotionPrediction(NamedTuple):
     dt: float  # [s]
     timestamps: Float[np.ndarray, " k"]  # [s] since the last frame, up to dt
     T_ref_body: Float[np.ndarray, "k 4 4"]
-    sigma: Float[np.ndarray, "2"]  # [m, rad] how far off it may be at dt
+    covariance: Float[np.ndarray, "6 6"]  # of it at dt, over right increments of the camera [m, rad]
+    support: Float[np.ndarray, "6 6"]  # the information in it that comes from features of this frame
     readings: PreintegratedImu
+
+    @property
+    def sigma(self) -> Float[np.ndarray, "2"]:
+        """How far off [m, rad] it may be at dt, along the worst axis."""
+        return _worst_sigmas(self.covariance)
 
 
 def next_pose(
-    state: SlamState, frame: Frame, image: Image, generator: np.random.Generator, key: PRNGKeyArray
+    state: SlamState,
+    frame: Frame,
+    image: Image,
+    features: Features | None,
+    generator: np.random.Generator,
+    key: PRNGKeyArray,
 ) -> SlamState:
     """The state with the pose of its last frame, which has none yet: registered, or predicted and marked."""
     config, policy, frames = state.config, state.config.recovery, state.frames
     predicted = _predict(state)
-    reach = _reach(state, predicted)
+    seen = None if features is None else _seen_pose(state, predicted, frame, features)
+    if seen is not None:
+        state, predicted = _with_features(state, predicted, seen)
+        frames = state.frames
+    held = seen is not None and bool(max(_worst_sigmas(seen.covariance)) < policy.held_by_features)
+    reach = _reach(state, predicted, held)
     if np.mean(frame.depth > 0) < policy.least_depth:
         return _update_state(state, frames, predicted, None, TrackingStatus.LOST)
     near_key, wide_key = jax.random.split(key)
     tracked = _track(state, frames, predicted, image, generator, near_key)
-    lost = _failed(state, tracked, reach)
-    if lost or _appearance_doubtful(state, tracked, predicted):
+    lost = _failed(state, tracked, reach, held)
+    if lost or (not held and _appearance_doubtful(state, tracked, predicted)):
         corrected, found = _relocalise(state, frame, image, predicted.T_ref_body[-1], reach, wide_key)
         other = _track(state, corrected, _constant_velocity(predicted, found), image, generator, wide_key)
-        other_lost = _failed(state, other, reach)
+        other_lost = _failed(state, other, reach, False)
         if lost or (not other_lost and _looks_better(policy, other, tracked)):
             frames, tracked, lost = corrected, other, other_lost
     unknown_place = lost and tracked.valid < config.track.minimum_valid
@@ -64,10 +86,13 @@ def next_pose(
         return _update_state(state, state.frames, predicted, None, TrackingStatus.DEAD_RECKONED)
     if lost:
         return _update_state(state, state.frames, predicted, tracked, TrackingStatus.LOST)
+    if seen is not None:
+        away = rigid.log(rigid.inverse(seen.T_world_cam) @ _T_world_cam(state, frames, tracked))
+        frames = frames.put(-1, feature_nis=away @ np.linalg.solve(seen.covariance, away) * _feature_scale(frames))
     status = TrackingStatus.TRACKED
     if (np.asarray(tracked.sigma) > policy.weak).any():
         status = TrackingStatus.WEAK
-    if not is_blank(frame) and _is_appearance_outlier(policy, frames, float(tracked.colour_error)):
+    if not held and not is_blank(frame) and _is_appearance_outlier(policy, frames, float(tracked.colour_error)):
         status = TrackingStatus.APPEARANCE_OUTLIER
     return _update_state(state, frames, predicted, tracked, status)
 
@@ -95,7 +120,79 @@ def _predict(state: SlamState) -> MotionPrediction:
     )
     if first:
         sigma = sigma + [0.3 * dt, 0.0 if config.uses_gyroscope else 0.3 * dt]  # as fast as a hand may move
-    return MotionPrediction(dt, timestamps, T_ref_body, sigma, readings)
+    covariance = np.diag(np.repeat(sigma**2, 3))
+    return MotionPrediction(dt, timestamps, T_ref_body, covariance, np.zeros((6, 6)), readings)
+
+
+def _seen_pose(
+    state: SlamState, predicted: MotionPrediction, frame: Frame, features: Features
+) -> FeaturePose | None:
+    """The camera's pose by features of the last frame, unless it is in doubt, and of keyframes.
+
+    Keyframes are those that look the same way from near; after a loss, those that look alike. The covariance
+    is as many times larger as poses by features have been off so far.
+    """
+    frames, i = state.frames, state.frames.count - 1
+    T_world_cam, keyframes = frames.T_world_body @ state.T_body_cam, np.flatnonzero(frames.keyframe)
+    if frames.doubted[i - 1]:
+        before = []
+        order = np.argsort(np.mean((state.thumbnails - thumbnail(frame)) ** 2, axis=(1, 2, 3)))
+    else:
+        assert state.features is not None
+        before = [(state.features, T_world_cam[i - 1])]
+        T_predicted = frames.T_world_body[i - 1] @ predicted.T_ref_body[-1] @ state.T_body_cam
+        away = rigid.inverse(T_predicted) @ T_world_cam[keyframes]
+        near = [float(np.median(f.depth[f.depth > 0])) if (f.depth > 0).any() else 1.0 for f in state.keyframe_features]
+        off = np.linalg.norm(away[:, :3, 3], axis=1) / near
+        off = off + rigid.rotation_angle(away[:, :3, :3], np.eye(3))
+        order = np.argsort(np.where(keyframes == i - 1, np.inf, off))[: _MATCHED - 1]
+    chosen = [(state.keyframe_features[k], T_world_cam[keyframes[k]]) for k in order[:_MATCHED]]
+    seen = locate_camera(features, [*before, *chosen], state.camera)
+    return seen and seen._replace(covariance=seen.covariance * _feature_scale(frames))
+
+
+def _feature_scale(frames: Frames) -> float:
+    """How many times larger than stated the covariance of poses by features has been so far."""
+    known = frames.feature_nis[np.isfinite(frames.feature_nis)][-_USUAL:]
+    return max(float(np.median(known)) / _CHI2_MEDIAN, 1.0) if len(known) >= 5 else _FIRST_SCALE
+
+
+def _with_features(
+    state: SlamState, predicted: MotionPrediction, seen: FeaturePose
+) -> tuple[SlamState, MotionPrediction]:
+    """The prediction and the pose by features together, each by its information.
+
+    Where they contradict each other the features count alone. After a loss the frames in doubt are moved to
+    lead there.
+    """
+    frames, i, T_body_cam = state.frames, state.frames.count - 1, state.T_body_cam
+    support = np.linalg.inv(seen.covariance)
+    if frames.doubted[i - 1]:
+        last, T_predicted = _last_found(frames), frames.T_world_body[i - 1] @ predicted.T_ref_body[-1]
+        T_world_body = seen.T_world_cam @ rigid.inverse(T_body_cam)
+        frames = _distribute_correction(frames, last, rigid.inverse(T_predicted) @ T_world_body)
+        covariance, fused = seen.covariance, T_world_body
+    else:
+        T_predicted = frames.T_world_body[i - 1] @ predicted.T_ref_body[-1] @ T_body_cam
+        apart = rigid.log(rigid.inverse(seen.T_world_cam) @ T_predicted)
+        both = seen.covariance + predicted.covariance
+        expected = np.linalg.inv(predicted.covariance)
+        if apart @ np.linalg.solve(both, apart) > _CHI2_999:
+            expected = np.zeros((6, 6))
+        covariance = np.linalg.inv(support + expected)
+        fused = seen.T_world_cam @ rigid.exp(covariance @ expected @ apart) @ rigid.inverse(T_body_cam)
+    steady = _constant_velocity(predicted, rigid.inverse(frames.T_world_body[i - 1]) @ fused)
+    return state._replace(frames=frames), steady._replace(covariance=covariance, support=support)
+
+
+def _T_world_cam(state: SlamState, frames: Frames, tracked: Tracked) -> Float[np.ndarray, "4 4"]:
+    """The pose of the camera that a registration found."""
+    return frames.T_world_body[-2] @ np.asarray(tracked.T_ref_body, np.float64) @ state.T_body_cam
+
+
+def _worst_sigmas(covariance: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, "2"]:
+    """Standard deviations [m, rad] along the worst axes."""
+    return np.sqrt([np.linalg.eigvalsh(covariance[k : k + 3, k : k + 3])[-1] for k in (0, 3)])
 
 
 def _constant_velocity(predicted: MotionPrediction, found: Float[np.ndarray, "4 4"]) -> MotionPrediction:
@@ -103,8 +200,10 @@ def _constant_velocity(predicted: MotionPrediction, found: Float[np.ndarray, "4 
     twist = rigid.log(found)
     share = np.arange(1, len(predicted.timestamps) + 1) / len(predicted.timestamps)
     T_ref_body = rigid.exp(share[:, None] * twist)
-    sigma = np.minimum(predicted.sigma, FOUND_SIGMA)
-    return predicted._replace(timestamps=predicted.dt * share, T_ref_body=T_ref_body, sigma=sigma)
+    covariance = np.diag(np.repeat(np.minimum(predicted.sigma, FOUND_SIGMA) ** 2, 3))
+    return predicted._replace(
+        timestamps=predicted.dt * share, T_ref_body=T_ref_body, covariance=covariance, support=np.zeros((6, 6))
+    )
 
 
 def _update_state(
@@ -153,12 +252,14 @@ def _observe_biases(state: SlamState, T_ref_body: np.ndarray, predicted: np.ndar
     return motion
 
 
-def _reach(state: SlamState, predicted: MotionPrediction) -> np.ndarray:
+def _reach(state: SlamState, predicted: MotionPrediction, held: bool) -> np.ndarray:
     """How far [m, rad] to search: what a hand's change of speed adds, and the time since a pose was found.
 
     Returns inf once that exceeds `farthest`: nothing is known any more.
     """
     config, t, dt = state.config, state.frames.t, predicted.dt
+    if held:
+        return 3 * predicted.sigma
     blind = t[-2] - t[_last_found(state.frames)]
     metres = 0.05 * blind + 0.02 * blind**2 if config.uses_accelerometer else 0.25 * dt**2 + 0.3 * blind
     radians = 0.005 * blind if config.uses_gyroscope else 0.5 * dt**2 + 0.3 * blind
@@ -269,7 +370,8 @@ def _problem(
         as_float(predicted.dt),
         as_float(timestamps),
         as_float(np.concatenate([predicted.T_ref_body, past])),
-        as_float(predicted.sigma),
+        as_float(predicted.covariance),
+        as_float(predicted.support),
         predicted.readings,
         jax.tree.map(as_float, imu_sigmas(config.imu_noise, imu, predicted.dt)),
         as_float(T_world_body[last]),
@@ -278,7 +380,7 @@ def _problem(
     )
 
 
-def _failed(state: SlamState, tracked: Tracked, reach: np.ndarray) -> bool:
+def _failed(state: SlamState, tracked: Tracked, reach: np.ndarray, held: bool) -> bool:
     """Whether registration went wrong: too little of the image explained, or far worse than it usually is.
 
     After a loss more is asked for: a wrong place may look right, and would be mapped.
@@ -286,13 +388,13 @@ def _failed(state: SlamState, tracked: Tracked, reach: np.ndarray) -> bool:
     frames, policy = state.frames, state.config.recovery
     usual = _usual(frames.loss[:-1], frames.lost[:-1])
     least, most = state.config.track.minimum_valid, policy.lost_loss
-    held = state.config.uses_accelerometer and max(reach) < policy.held
-    if frames.lost[-3:-1].any() and not held:
+    sure = held or (state.config.uses_accelerometer and max(reach) < policy.held)
+    if frames.lost[-3:-1].any() and not sure:
         near = np.isfinite(reach).all()
         least = policy.found_valid if near else policy.recognised_valid
         most = policy.found_loss if near else policy.recognised_loss
     finite = np.isfinite(tracked.loss) and np.isfinite(tracked.T_ref_body).all()
-    explained = finite and tracked.valid >= least
+    explained = finite and (held or tracked.valid >= least)
     # One sigma is what the sensor's own noise leaves; without noise the usual loss would be next to nothing.
     return not (explained and tracked.loss < most * max(usual, 1.0))
 

@@ -15,6 +15,7 @@ from jaxpose.scenes import GridConfig
 from jaxpose.scenes.voxel_blocks import BlockConfig
 from jaxpose.slam.config import SlamConfig
 from jaxpose.slam.map.photometric import MapState
+from jaxpose.slam.tracking.features import Features
 
 # Settings are no leaves of a state: a state is a pytree of arrays and numbers.
 jax.tree_util.register_static(SlamConfig)
@@ -39,6 +40,7 @@ class Frames(NamedTuple):
     T_world_body: Float[np.ndarray, "n 4 4"]
     T_inner: Float[np.ndarray, "n 4 4"]  # motion since the last frame, in the frame `intrinsic`
     status: Int8[np.ndarray, " n"]  # TrackingStatus
+    feature_nis: Float[np.ndarray, " n"]  # squared Mahalanobis distance from the pose by features
     mapped: Bool[np.ndarray, " n"]  # the map was made from it
     keyframe: Bool[np.ndarray, " n"]
     iterations: Int[np.ndarray, " n"]
@@ -91,6 +93,7 @@ def no_frames(t: Float[np.ndarray, " n"]) -> Frames:
         T_world_body=np.full((count, 4, 4), np.nan),
         T_inner=np.full((count, 4, 4), np.nan),
         status=np.zeros(count, np.int8),
+        feature_nis=unknown,
         mapped=no,
         keyframe=no,
         iterations=np.zeros(count, int),
@@ -133,6 +136,8 @@ class SlamState(NamedTuple):
     exposure: Float[np.ndarray | Array, "3"]  # of the last registered image (`observation.Image`)
     max_depth: float  # [m] how deep the map is
     thumbnails: Float[np.ndarray, "k 2 12 16"]  # of the keyframes (`keyframes.thumbnail`)
+    features: Features | None  # of the last frame; None: not used, or before the first
+    keyframe_features: tuple[Features, ...]
     images: tuple[Frame, ...]  # of the keyframes, where no recording can give them again
     grid: BlockConfig | GridConfig | None  # how finely the map resolves space; None: before the first frame
     map: MapState | None

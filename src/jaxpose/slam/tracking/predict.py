@@ -27,7 +27,8 @@ class TrackingProblem(NamedTuple):
     t: Float[Array, ""]  # [s] of this frame, since the last
     timestamps: Float[Array, " k"]  # [s] of the predicted motion, and of earlier frames (negative)
     T_ref_body: Float[Array, "k 4 4"]
-    sigma: Float[Array, "2"]  # [m, rad] how far the prediction for `t` may be off
+    covariance: Float[Array, "6 6"]  # of the prediction for `t`, over right increments of the camera [m, rad]
+    support: Float[Array, "6 6"]  # the information in it that comes from features of this frame
     readings: "PreintegratedImu"
     imu_sigmas: ResidualSigmas
     T_world_ref: Float[Array, "4 4"]

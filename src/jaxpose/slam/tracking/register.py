@@ -89,10 +89,12 @@ class Slopes(NamedTuple):
     colour: Float[Array, "n 3 6"]
 
 
-def starts(T_ref_body: Float[Array, "4 4"], sigma: Float[Array, "2"]) -> Float[Array, "k 4 4"]:
-    """Motions to try first: the predicted one, and those `sigma` [m, rad] away along each axis."""
-    axes = jnp.concatenate([jnp.eye(6), -jnp.eye(6)]) * jnp.repeat(sigma, 3)[None]
-    return jnp.concatenate([T_ref_body[None], se3.compose(T_ref_body, se3.exp(axes))])
+def starts(T_world_cam: Float[Array, "4 4"], covariance: Float[Array, "6 6"]) -> Float[Array, "k 4 4"]:
+    """Poses to try first: the predicted one, and those a sigma away along each axis of its covariance."""
+    variance, axes = jnp.linalg.eigh(covariance)
+    axes = (axes * jnp.sqrt(jnp.maximum(variance, 0))[None]).T
+    away = se3.exp(jnp.concatenate([axes, -axes]))
+    return jnp.concatenate([T_world_cam[None], se3.compose(T_world_cam, away)])
 
 
 def best_start(
@@ -168,17 +170,17 @@ def register(
     sample_map: MapSampler,
     T_world_cam: Float[Array, "4 4"],
     T_world_predicted: Float[Array, "4 4"],
-    sigma: Float[Array, "2"],
+    covariance: Float[Array, "6 6"],
     pixels: Pixels,
     config: TrackConfig,
 ) -> Registration:
     """The pose near a start that brings measured points onto the map's surface, by Gauss-Newton steps.
 
     Residuals count by their size, within one sigma by their square: by squares throughout, a camera between
-    furniture was lost. The predicted pose is a measurement too, with `sigma` [m, rad]; against it the image
-    counts as `_INDEPENDENT` pixels, since errors of a map go together.
+    furniture was lost. The predicted pose is a measurement too, with its covariance [m, rad]; against it the
+    image counts as `_INDEPENDENT` pixels, since errors of a map go together.
     """
-    prior = jnp.repeat(sigma, 3) ** -2
+    prior = jnp.linalg.inv(covariance)
 
     def equations(T):
         found, by = surface_residuals(sample_map, T, pixels, config)
@@ -190,8 +192,9 @@ def register(
         away = se3.log(se3.compose(se3.inverse(T_world_predicted), T))
         expected = _weight(found) * prior
         information = jnp.matmul(weighted.T, slope, precision="highest")
-        descent = jnp.matmul(residual, weighted, precision="highest") + expected * away
-        return information, jnp.diag(expected), descent, found
+        pull = jnp.matmul(expected, away, precision="highest")
+        descent = jnp.matmul(residual, weighted, precision="highest") + pull
+        return information, expected, descent, found
 
     def improve(carry):
         at, _ = carry
@@ -217,9 +220,10 @@ def register(
     return jax.lax.while_loop(unsettled, improve, (start, jnp.inf))[0]
 
 
-def pose_sigma(found: Registration) -> Float[Array, "2"]:
-    """Standard deviation [m, rad] of an aligned pose along its worst axis, by the image alone."""
-    covariance = jnp.linalg.inv(found.information / _weight(found.residuals) + 1e-6 * jnp.eye(6))
+def pose_sigma(found: Registration, support: Float[Array, "6 6"]) -> Float[Array, "2"]:
+    """Standard deviation [m, rad] of an aligned pose along its worst axis, by the image and its features."""
+    information = found.information / _weight(found.residuals) + support
+    covariance = jnp.linalg.inv(information + 1e-6 * jnp.eye(6))
     worst = lambda block: jnp.sqrt(jnp.linalg.eigvalsh(block)[-1])
     return jnp.stack([worst(covariance[:3, :3]), worst(covariance[3:, 3:])])
 
@@ -237,10 +241,10 @@ def make_register(sample_map: MapQuery, camera: Camera, config: TrackConfig) -> 
         del max_depth  # nothing is rendered
         sample = partial(sample_map, scene_params, fusion_state)
         pixels = sample_pixels(key, image, camera, config.pixels, edge=config.edge)
-        tries = starts(problem.T_ref_body[AHEAD - 1], problem.sigma)
-        T_world_tries = se3.compose(problem.T_world_ref, se3.compose(tries, problem.T_body_cam))
-        start = best_start(sample, T_world_tries, pixels)
-        found = register(sample, start, T_world_tries[0], problem.sigma, pixels, config)
+        T_ref_cam = se3.compose(problem.T_ref_body[AHEAD - 1], problem.T_body_cam)
+        predicted = se3.compose(problem.T_world_ref, T_ref_cam)
+        start = best_start(sample, starts(predicted, problem.covariance), pixels)
+        found = register(sample, start, predicted, problem.covariance, pixels, config)
         T_world_body = se3.compose(found.T_world_cam, se3.inverse(problem.T_body_cam))
         residuals = found.residuals
         return Tracked(
@@ -252,7 +256,7 @@ def make_register(sample_map: MapQuery, camera: Camera, config: TrackConfig) -> 
             image.exposure * residuals.exposure,
             residuals.valid,
             found.iterations,
-            pose_sigma(found),
+            pose_sigma(found, problem.support),
         )
 
     return step

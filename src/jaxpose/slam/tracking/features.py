@@ -1,0 +1,201 @@
+"""Sparse features: the camera's pose by corners that earlier frames have seen, whatever map there is.
+
+Corners of a pyramid, spread over the image, described by ORB (Rublee et al. 2011) and matched by the ratio test
+(Lowe 2004); the pose by RANSAC over three-point solutions (Ke and Roumeliotis 2017), refined by reweighted
+least squares of the reprojection errors, whose spread is their noise. Detection, description, matching and
+RANSAC are OpenCV's.
+"""
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from jaxpose.datasets.types import Frame
+from jaxpose.errors import DataError
+from jaxpose.geometry import rigid
+from jaxpose.geometry.camera import Camera, unproject_numpy
+
+FEWEST = 12  # inliers of a pose that is believed: at random, three points and a few more agree now and then
+
+_MOST = 1000  # features of an image
+_ROWS, _COLUMNS = 6, 8  # of cells that they are spread over
+_CONTRAST = 7  # [grey levels] by which a corner stands out
+_PYRAMID = (1.2, 8)  # from level to level, and levels
+_RATIO = 0.8  # of the distance to the best match against that to the second best
+_OUTLIER_PX = 3.0  # of reprojection, in RANSAC
+_OUTLIER = 3.0  # sigmas of reprojection, in the end
+_LEAST_NOISE = 0.3  # [px] of the finest level
+_INDEPENDENT = 50.0  # features: errors of depth and of intrinsics go together
+_STEPS = 10
+
+
+class Features(NamedTuple):
+    """Corners of one image: where they point to, how far away they are, how coarse, and what they look like."""
+
+    direction_cam: Float[np.ndarray, "n 3"]  # z = 1
+    depth: Float[np.ndarray, " n"]  # [m] along the optical axis; 0 where there is none
+    scale: Float[np.ndarray, " n"]  # [px] of the level of the pyramid
+    descriptor: UInt8[np.ndarray, "n 32"]
+
+    @property
+    def points_cam(self) -> Float[np.ndarray, "n 3"]:
+        """Where they are, in camera axes [m]; the camera's centre for those without depth."""
+        return self.direction_cam * self.depth[:, None]
+
+
+class FeaturePose(NamedTuple):
+    """A camera's pose by features."""
+
+    T_world_cam: Float[np.ndarray, "4 4"]
+    covariance: Float[np.ndarray, "6 6"]  # of right increments [m, rad], by the spread of reprojection
+    inliers: int
+
+
+def detect(frame: Frame, camera: Camera) -> Features:
+    """The corners of a frame, at most about a thousand."""
+    cv2 = _opencv()
+    grey = cv2.cvtColor(np.ascontiguousarray(frame.rgb), cv2.COLOR_RGB2GRAY)
+    keypoints, descriptor = _detector().compute(grey, _spread(_detector().detect(grey, None), grey.shape))
+    if descriptor is None:
+        return Features(np.zeros((0, 3)), np.zeros(0), np.zeros(0), np.zeros((0, 32), np.uint8))
+    pixel = np.array([k.pt for k in keypoints], np.float64)
+    scale = _PYRAMID[0] ** np.array([k.octave for k in keypoints], np.float64)
+    column, row = np.rint(pixel).astype(int).T
+    depth = frame.depth[row, column].astype(np.float64)
+    return Features(unproject_numpy(camera, pixel), depth, scale, descriptor)
+
+
+def locate_camera(
+    now: Features, before: Sequence[tuple[Features, Float[np.ndarray, "4 4"]]], camera: Camera
+) -> FeaturePose | None:
+    """The pose of the camera that sees features among those of earlier frames, whose poses are known.
+
+    Args:
+        now: of the frame whose pose is asked for; they need no depth.
+        before: features of frames with their poses `T_world_cam`; those without depth are left out.
+        camera: of all of them.
+
+    Returns:
+        The pose; None where fewer than FEWEST features agree on one.
+    """
+    points, chosen = [], []
+    for features, T_world_cam in before:
+        i, j = _matches(features, now)
+        near = features.depth[i] > 0
+        points.append(rigid.apply(T_world_cam, features.points_cam[i[near]]))
+        chosen.append(j[near])
+    if not points:
+        return None
+    point, row = np.concatenate(points), np.concatenate(chosen)
+    focal = float(camera.fx + camera.fy) / 2
+    return _pose(point, now.direction_cam[row, :2], now.scale[row] / focal, focal)
+
+
+def _opencv() -> Any:
+    """OpenCV, loaded when it is first used."""
+    try:
+        import cv2
+    except ImportError as error:
+        raise DataError(
+            f"features: expected OpenCV, got {error}: pip install opencv-python-headless, or --features none"
+        ) from None
+    return cv2
+
+
+@lru_cache(maxsize=1)
+def _detector():
+    cv2 = _opencv()
+    return cv2.ORB_create(4 * _MOST, *_PYRAMID, 31, 0, 2, cv2.ORB_HARRIS_SCORE, 31, _CONTRAST)
+
+
+def _spread(keypoints: Sequence[Any], shape: tuple[int, ...]) -> Sequence[Any]:
+    """The strongest keypoints of each cell of the image, as many of each as there is room for."""
+    if len(keypoints) <= _MOST:
+        return keypoints
+    pixel = np.array([k.pt for k in keypoints])
+    cell = (pixel / [shape[1] / _COLUMNS, shape[0] / _ROWS]).astype(int) @ [1, _COLUMNS]
+    order = np.lexsort((-np.array([k.response for k in keypoints]), cell))
+    rank = np.arange(len(order)) - np.searchsorted(cell[order], cell[order])
+    return [keypoints[k] for k in order[np.argsort(rank, kind="stable")[:_MOST]]]
+
+
+def _matches(a: Features, b: Features) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
+    """Which features of two images look alike, and like no other; each of `b` once."""
+    cv2, none = _opencv(), np.zeros(0, int)
+    if len(a.depth) < 2 or len(b.depth) < 2:
+        return none, none
+    found = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(a.descriptor, b.descriptor, k=2)
+    pairs = [
+        (best.queryIdx, best.trainIdx, best.distance)
+        for best, second in found
+        if best.distance < _RATIO * second.distance
+    ]
+    if not pairs:
+        return none, none
+    i, j, distance = np.array(pairs).T
+    order = np.argsort(distance, kind="stable")
+    _, first = np.unique(j[order], return_index=True)
+    kept = order[np.sort(first)]
+    return i[kept].astype(int), j[kept].astype(int)
+
+
+def _pose(
+    point: Float[np.ndarray, "n 3"], xy: Float[np.ndarray, "n 2"], sigma: Float[np.ndarray, " n"], focal: float
+) -> FeaturePose | None:
+    """The pose of a camera that sees world points at `xy` (z = 1), each known to `sigma` by its scale."""
+    cv2 = _opencv()
+    if len(point) < FEWEST:
+        return None
+    centre = point.mean(axis=0)  # far from the origin, RANSAC's solver would lose digits
+    found, rotation, translation, chosen = cv2.solvePnPRansac(
+        point - centre, np.ascontiguousarray(xy), np.eye(3), None, iterationsCount=300,
+        reprojectionError=_OUTLIER_PX / focal, confidence=0.999, flags=cv2.SOLVEPNP_AP3P,
+    )  # fmt: skip
+    if not found or chosen is None or len(chosen) < FEWEST:
+        return None
+    T = rigid.inverse(rigid.make(cv2.Rodrigues(rotation)[0], translation[:, 0]))
+    refined = _refine(T, point - centre, xy, sigma)
+    if refined is None:
+        return None
+    T, covariance, inliers = refined
+    T[:3, 3] += centre
+    return FeaturePose(T, covariance * max(inliers / _INDEPENDENT, 1), inliers)
+
+
+def _refine(T, point, xy, sigma):
+    """The pose of least reprojection error (Geman and McClure's), its covariance and inliers; None of too few."""
+    for _ in range(_STEPS):
+        point_cam = rigid.apply(rigid.inverse(T), point)
+        front = point_cam[:, 2] > 1e-3
+        depth = np.where(front, point_cam[:, 2], 1.0)
+        seen = point_cam[:, :2] / depth[:, None]
+        residual = (seen - xy) / sigma[:, None]
+        size = np.where(front, np.linalg.norm(residual, axis=1), np.inf)
+        if not (size < 5 * _OUTLIER).any():
+            return None
+        # The median length of a normal vector in the plane is 1.177 sigmas.
+        noise = max(float(np.median(size[size < 5 * _OUTLIER])) / 1.177, _LEAST_NOISE)
+        weight = 1 / (1 + (size / (_OUTLIER * noise)) ** 2) ** 2
+        change = np.zeros((len(point), 2, 3))  # of the residual by the point in camera axes
+        change[:, 0, 0] = change[:, 1, 1] = 1
+        change[:, :, 2] = -seen
+        change /= (depth * sigma)[:, None, None]
+        by_pose = np.concatenate([-change, np.cross(change, point_cam[:, None])], axis=-1)
+        information = np.einsum("n,nki,nkj->ij", weight, by_pose, by_pose)
+        descent = np.einsum("n,nki,nk->i", weight, by_pose, np.where(front[:, None], residual, 0))
+        if np.linalg.cond(information) > 1e12:
+            return None
+        step = -np.linalg.solve(information, descent)
+        T = T @ rigid.exp(step)
+        if np.linalg.norm(step) < 1e-7:
+            break
+    inlier = size < _OUTLIER * noise
+    if inlier.sum() < FEWEST:
+        return None
+    information = np.einsum("nki,nkj->ij", by_pose[inlier], by_pose[inlier])
+    if np.linalg.cond(information) > 1e12:
+        return None
+    return T, noise**2 * np.linalg.inv(information), int(inlier.sum())
