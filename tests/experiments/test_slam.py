@@ -232,6 +232,8 @@ def test_imu_is_simulated_before_thinning(folder):
         (["--recorded-hz", "30"], r"--recorded-hz: has no effect without --data"),
         (["--room.along", "x", "--data", "y"], r"--room\.along: has no effect with --data"),
         (["--room.width", "100", "--data", "y"], r"--room\.width: has no effect with --data"),
+        (["--room.sensor", "stereo", "--data", "y"], r"--room\.sensor: has no effect with --data"),
+        (["--room.sensor", "sonar"], r"invalid choice 'sonar'.*'axial', 'structured_light', 'stereo'"),
         (["--room.along", "x", "--room.speed", "2"], r"--room\.speed: has no effect with --room\.along"),
         (["--imu-rotation", "slerp"], r"--imu-rotation: has no effect where no IMU is simulated"),
         (
