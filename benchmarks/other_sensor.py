@@ -19,7 +19,7 @@ import tyro
 from scipy.ndimage import gaussian_filter
 from tqdm import tqdm
 
-from jaxpose.datasets.synthetic import sensor
+from jaxpose.datasets.synthetic.depth_sensors import BASELINE, projector_holes
 from jaxpose.datasets.synthetic.furniture import SIZE
 from jaxpose.datasets.synthetic.room_renderer import render, scenery
 from jaxpose.files import trajectories
@@ -28,7 +28,7 @@ from jaxpose.geometry.rigid import rotation_angle
 from jaxpose.imu.simulation import Interpolant, interpolant
 
 FOCAL = 585.0  # [px]
-DISPARITY = 580 * sensor.BASELINE  # [px m]
+DISPARITY = 580 * BASELINE  # [px m]
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ def main() -> None:
         colour = np.roll(colour, config.shift, axis=(1, 0))
         colour = colour * np.exp(config.brighter * np.sin(2 * np.pi * t / 7.3))
         noise, holes = np.random.default_rng([config.seed, i]).spawn(2)
-        found = np.where(sensor.holes(depth, cosine, camera, holes), 0, measured(depth, noise, config))
+        found = np.where(projector_holes(depth, cosine, camera, holes), 0, measured(depth, noise, config))
         iio.imwrite(config.out / f"color/{i:05d}.jpg", np.clip(colour, 0, 255).astype(np.uint8), quality=90)
         iio.imwrite(config.out / f"depth/{i:05d}.png", np.round(1000 * found).astype(np.uint16))
     np.savetxt(config.out / "poses.txt", poses.reshape(-1, 16))

@@ -18,6 +18,7 @@ LAYOUTS = {
     "replica": ["traj.txt", "results/frame000000.jpg", "results/depth000000.png"],
     "scannet": ["color/0.jpg", "depth/0.png", "pose/0.txt", "intrinsic/intrinsic_depth.txt"],
     "euroc": ["mav0/cam0/data.csv", "mav0/imu0/data.csv", "data.ply"],
+    "icl_nuim": ["associations.txt", "livingRoom2.gt.freiburg", "rgb/1.png", "depth/1.png"],
     "plain": ["color/0.jpg", "depth/0.png", "poses.txt", "camera-intrinsics.txt"],
 }
 
@@ -32,8 +33,15 @@ def touch(folder, files):
 def test_formats_are_told_apart_and_their_loader_is_asked(tmp_path, name):
     touch(tmp_path, LAYOUTS[name])
     assert rgbd_registry.find_format(tmp_path) == rgbd_registry.find_format(str(tmp_path)) == name
-    with pytest.raises(DataError, match=r"expected (an image|lines of a timestamp)"):
+    with pytest.raises(DataError, match=r"expected (an image|lines of (a timestamp|N depth/N.png))"):
         rgbd_registry.load_recording(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["tum", "plain"])
+def test_a_list_of_pairs_makes_no_icl_nuim_of_other_layouts(tmp_path, name):
+    """Users of TUM's associate.py keep its pairs beside the images."""
+    touch(tmp_path, [*LAYOUTS[name], "associations.txt"])
+    assert rgbd_registry.find_format(tmp_path) == name
 
 
 @pytest.mark.parametrize(
@@ -44,6 +52,7 @@ def test_formats_are_told_apart_and_their_loader_is_asked(tmp_path, name):
         ("replica", ["results/frame000000.jpg"]),
         ("scannet", ["frames/color/0.jpg"]),
         ("euroc", ["imu0/data.csv"]),
+        ("icl_nuim", ["associations.txt"]),
         ("plain", ["depth/0.png"]),
     ],
 )
@@ -72,7 +81,8 @@ def test_a_wrong_folder_is_told_what_was_expected_and_found(tmp_path):
         assert "\n" not in message
         for name in LAYOUTS:
             assert f"({name})" in message
-        for file in ("frame-NNNNNN.color.png", "rgb.txt", "traj.txt", "pose/", "mav0", "color/"):
+        lists = ("rgb.txt", "traj.txt", "associations.txt")
+        for file in ("frame-NNNNNN.color.png", *lists, "pose/", "mav0", "color/"):
             assert file in message
 
 
@@ -103,7 +113,8 @@ def test_the_commands_find_the_format(desk):
     assert source.recording.imu is None
     touch(desk, ["rgb.txt"])
     assert load(rgbd_slam.Config(data=desk, format="plain")).metadata["format"] == "plain"
-    assert "simulated at 200 Hz" in load(imu_slam.Config(data=desk, format="plain")).imu
+    imu = load(imu_slam.Config(data=desk, format="plain")).imu
+    assert "simulated at 200 Hz" in imu and "gravity 0 0 -9.81 m/s^2" in imu
 
 
 def test_the_commands_take_the_recording_s_own_imu(desk, walk, save):

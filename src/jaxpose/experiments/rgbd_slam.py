@@ -1,8 +1,8 @@
 """RGB-D SLAM: a camera tracked by a continuous pose field from colour and depth alone.
 
 Without options it walks through a synthetic room at 5 Hz and writes a run folder under outputs/rgbd_slam.
-`--data DIR` tracks a recording instead: 7-Scenes, TUM, Replica, ScanNet, EuRoC or a plain folder, found by
-its files. The same as imu_slam, but for the default of `--imu`.
+`--data DIR` tracks a recording instead: 7-Scenes, TUM, ICL-NUIM, Replica, ScanNet, EuRoC or a plain folder,
+found by its files. The same as imu_slam, but for the default of `--imu`.
 """
 
 from collections.abc import Sequence

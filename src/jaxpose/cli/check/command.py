@@ -1,9 +1,10 @@
 """What a set of data is, and its faults: timestamps, poses, camera, depth, IMU, and how they agree.
 
-DATA is a folder of an RGB-D recording (7-Scenes, TUM, Replica, ScanNet, EuRoC, plain), of photographs with
-poses (Blender, nerfstudio, LLFF), of an IMU with ground truth (EuRoC), or of events (DAVIS text, EventNeRF,
-npz, DSEC's HDF5); a trajectory file (TUM, KITTI, EuRoC, 4x4), or a folder of such files. The format is found
-by the files. Ends with 0 if no fault is found, with 2 for warnings, and with 1 for data that cannot be used.
+DATA is a folder of an RGB-D recording (7-Scenes, TUM, ICL-NUIM, Replica, ScanNet, EuRoC, plain), of
+photographs with poses (Blender, nerfstudio, LLFF), of an IMU with ground truth (EuRoC), or of events (DAVIS
+text, EventNeRF, npz, DSEC's HDF5); a trajectory file (TUM, KITTI, EuRoC, 4x4), or a folder of such files. The
+format is found by the files. Ends with 0 if no fault is found, with 2 for warnings, and with 1 for data that
+cannot be used.
 """
 
 import sys
@@ -20,9 +21,9 @@ from jaxpose.experiments.command import Command, execute
 from jaxpose.experiments.progress import OnUpdate, Update, silent
 
 _KNOWN = (
-    "an RGB-D recording (7-Scenes, TUM, Replica, ScanNet, EuRoC, or color/ and depth/ with intrinsics), "
-    "photographs (transforms.json, transforms_train.json or poses_bounds.npy), mav0/imu0 with ground truth, "
-    "events (events*.txt, *.npz, *.h5, or EventNeRF's folders), or trajectories"
+    "an RGB-D recording (7-Scenes, TUM, ICL-NUIM, Replica, ScanNet, EuRoC, or color/ and depth/ with "
+    "intrinsics), photographs (transforms.json, transforms_train.json or poses_bounds.npy), mav0/imu0 with "
+    "ground truth, events (events*.txt, *.npz, *.h5, or EventNeRF's folders), or trajectories"
 )
 
 

@@ -1,4 +1,5 @@
 from . import euroc as euroc
+from . import icl_nuim as icl_nuim
 from . import plain as plain
 from . import replica as replica
 from . import scannet as scannet

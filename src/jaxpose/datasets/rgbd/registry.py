@@ -5,11 +5,11 @@ from pathlib import Path
 from typing import Literal, NamedTuple, get_args
 
 from jaxpose.datasets.images import found
-from jaxpose.datasets.rgbd import euroc, plain, replica, scannet, sevenscenes, tum
+from jaxpose.datasets.rgbd import euroc, icl_nuim, plain, replica, scannet, sevenscenes, tum
 from jaxpose.datasets.types import Recording
 from jaxpose.errors import DataError
 
-Format = Literal["sevenscenes", "tum", "replica", "scannet", "euroc", "plain"]
+Format = Literal["sevenscenes", "tum", "replica", "scannet", "euroc", "icl_nuim", "plain"]
 
 
 class _Layout(NamedTuple):
@@ -35,6 +35,11 @@ _LAYOUTS: dict[Format, _Layout] = {
         "color/, depth/ and pose/", scannet.detect, lambda path, rate_hz: scannet.load(path, rate_hz=rate_hz)
     ),
     "euroc": _Layout("mav0/cam0 and mav0/imu0", euroc.detect, lambda path, rate_hz: euroc.load(path)),
+    "icl_nuim": _Layout(
+        "associations.txt, depth/ and rgb/",
+        icl_nuim.detect,
+        lambda path, rate_hz: icl_nuim.load(path, rate_hz=rate_hz),
+    ),
     "plain": _Layout(
         "color/, depth/ and intrinsics",
         plain.detect,

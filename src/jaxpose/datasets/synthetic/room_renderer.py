@@ -12,8 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt8
 
-from jaxpose.datasets.synthetic import hand_held, sensor
+from jaxpose.datasets.synthetic import hand_held
 from jaxpose.datasets.synthetic.atlas import Atlas, bake, gather, look_up
+from jaxpose.datasets.synthetic.depth_sensors import RANGES, Sensor, measured_depth
 from jaxpose.datasets.synthetic.furniture import Extent, furnish
 from jaxpose.datasets.synthetic.shapes import Shapes, cast, locate, within_cone
 from jaxpose.datasets.synthetic.trajectory import Motion, by_hand, recorded
@@ -33,8 +34,11 @@ class RoomConfig:
     height: int = 240  # [px] of the images
     seed: int = 0  # of the room, the walk and the noise of its sensors
     speed: float = 1.0  # 1 walks at about 0.5 m/s and turns by 20 to 50 deg/s
-    depth_noise: float = 1.0  # times Kinect's; 0 is exact depth
-    holes: bool = True  # no depth in the projector's shadow and on grazing surfaces
+    # What measures depth. axial: the noise that tracking assumes; the others differ from it: disparities in
+    # steps, two cameras, the phase of light, or points of a coarser camera that are carried over to colour.
+    sensor: Sensor = "axial"
+    depth_noise: float = 1.0  # times the sensor's random noise; 0 with axial is exact depth
+    holes: bool = True  # no depth on what defeats the sensor: shadows, grazing, dark or plain surfaces
     imu_noise: ImuNoise = ADIS16448
     gravity_world: tuple[float, float, float] = GRAVITY_WORLD  # [m/s^2] z is up
     # A EuRoC sequence whose recorded motion and IMU take the place of the walk and of `imu_*`.
@@ -47,6 +51,8 @@ class RoomConfig:
         for name in ("seed", "depth_noise"):
             if not 0 <= getattr(self, name) < np.inf:
                 raise ValueError(f"RoomConfig.{name}: expected zero or more, got {getattr(self, name)}")
+        if self.sensor not in RANGES:
+            raise ValueError(f"RoomConfig.sensor: expected one of {', '.join(RANGES)}, got {self.sensor}")
         if self.duration_s * self.rate_hz < 1:
             raise ValueError(f"RoomConfig: expected two frames, got {self.duration_s} s at {self.rate_hz} Hz")
 
@@ -74,11 +80,10 @@ def room(config: RoomConfig = RoomConfig()) -> Recording:
     @lru_cache(maxsize=128)
     def read(i: int) -> Frame:
         rgb, depth, cosine = jax.device_get(render(camera, shapes, atlas, np.float32(T_world_cam[i])))
-        noise_rng, hole_rng = np.random.default_rng([config.seed, i]).spawn(2)
-        seen = ~sensor.holes(depth, cosine, camera, hole_rng) if config.holes else True
-        if config.depth_noise:
-            depth = sensor.add_noise(depth, noise_rng, scale=config.depth_noise)
-        depth = np.where(seen, depth, np.float32(0))
+        depth = measured_depth(
+            config.sensor, depth, rgb, cosine, camera, np.random.default_rng([config.seed, i]),
+            noise=config.depth_noise, holes=config.holes,
+        )  # fmt: skip
         depth.setflags(write=False)  # the next reader gets the same array
         return Frame(rgb, depth)
 

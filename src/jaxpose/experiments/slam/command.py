@@ -1,9 +1,9 @@
 """Track an RGB-D camera, with or without an IMU, by a continuous pose field.
 
 Without options it walks through a synthetic room, at 5 Hz with a 200 Hz IMU, and writes a run folder under
-outputs/slam. `--data DIR` tracks a recording: 7-Scenes, TUM, Replica, ScanNet, EuRoC or a plain folder, found
-by its files, with its own IMU (EuRoC, `--imu-file`) or one simulated from its true poses. `--imu none` goes
-without, `--compare` puts all IMU modes side by side.
+outputs/slam. `--data DIR` tracks a recording: 7-Scenes, TUM, ICL-NUIM, Replica, ScanNet, EuRoC or a plain
+folder, found by its files, with its own IMU (EuRoC, `--imu-file`) or one simulated from its true poses.
+`--imu none` goes without, `--compare` puts all IMU modes side by side.
 """
 
 from collections.abc import Sequence

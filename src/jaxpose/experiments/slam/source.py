@@ -61,9 +61,10 @@ def load(options: Options) -> Source:
         imu, own_imu = "none", recording.imu is not None
         if not own_imu and (options.compare or options.slam.imu != "none"):
             recording = recording._replace(imu=_simulated(recording, options))
+            gravity = " ".join(f"{x:.3g}" for x in recording.gravity_world)
             imu = (
                 f"simulated at {SIMULATED_HZ:g} Hz from ground truth before thinning (cubic spline "
-                f"positions, {options.imu_rotation or 'slerp'} rotations, gravity along -z), "
+                f"positions, {options.imu_rotation or 'slerp'} rotations, gravity {gravity} m/s^2), "
                 f"{_sheet(options.slam.imu_noise)}, seed {options.slam.seed}"
             )
     if own_imu:
