@@ -15,7 +15,7 @@ from jaxpose.geometry import se3
 from jaxpose.geometry.camera import Camera
 from jaxpose.slam import RecoveryConfig, SlamConfig, run
 from jaxpose.slam.keyframes import thumbnail
-from jaxpose.slam.tracker import _distribute_correction, _is_appearance_outlier, _looks_better, _usual
+from jaxpose.slam.tracker import _is_appearance_outlier, _looks_better, _usual
 from jaxpose.slam.tracking.register import Tracked
 from jaxpose.slam.tracking.relocalise import CENTRES, relocalise
 from jaxpose.slam.types import Frames, TrackingStatus, no_frames
@@ -64,7 +64,8 @@ def test_a_search_begins_at_every_centre(find):
 def test_lost_frames_lead_to_where_the_camera_is_found():
     frames = no_frames(np.array([0.0, 1.0, 2.0, 4.0])).put(np.arange(4), T_world_body=np.eye(4))
     correction = np.asarray(se3.exp(jnp.array([0.4, 0.0, 0.0, 0.0, 0.0, 0.8])), np.float64)
-    bent = _distribute_correction(frames, 0, correction)
+    frames = frames.put(np.array([1, 2]), status=int(TrackingStatus.LOST))
+    bent = frames.corrected(correction)
     np.testing.assert_array_equal(bent.T_world_body[[0, 3]], np.tile(np.eye(4), (2, 1, 1)))
     for i, share in ((1, 0.25), (2, 0.5)):
         expected = np.asarray(se3.exp(share * jnp.array([0.4, 0.0, 0.0, 0.0, 0.0, 0.8])))
@@ -74,8 +75,9 @@ def test_lost_frames_lead_to_where_the_camera_is_found():
 
 def test_of_two_poses_that_fit_the_surfaces_colour_decides():
     found = Tracked(
-        np.eye(4), None, 1.0, 1.0, colour_error=0.1, exposure=np.ones(3), valid=0.9, iterations=5, sigma=0.0
-    )
+        np.eye(4), None, 1.0, 1.0, colour_error=0.1, exposure=np.ones(3), valid=0.9, iterations=5, sigma=0.0,
+        information=np.zeros((6, 6)),
+    )  # fmt: skip
     better = found._replace(colour_error=0.03)
     assert _looks_better(POLICY, better, found) and not _looks_better(POLICY, found, better)
     assert not _looks_better(POLICY, found._replace(colour_error=0.099), found)  # no matter

@@ -1,7 +1,5 @@
 """Where the camera is at the next frame: predicted, registered, and searched for where that is in doubt."""
 
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,11 +11,13 @@ from jaxpose.slam.config import RecoveryConfig
 from jaxpose.slam.keyframes import thumbnail
 from jaxpose.slam.map.backend import map_backend, scene_params
 from jaxpose.slam.observation import Image, is_blank
-from jaxpose.slam.tracking.features import FeaturePose, Features, locate_camera
+from jaxpose.slam.tracking.feature_pose import feature_nis, seen_pose, with_features
+from jaxpose.slam.tracking.features import Features
 from jaxpose.slam.tracking.predict import (
     BEHIND,
-    PreintegratedImu,
+    MotionPrediction,
     TrackingProblem,
+    constant_velocity,
     end_velocity,
     imu_sigmas,
     observe_acceleration,
@@ -25,32 +25,12 @@ from jaxpose.slam.tracking.predict import (
     predict,
     prediction_sigma,
     readings_between,
+    worst_sigmas,
 )
 from jaxpose.slam.tracking.reference_frames import reference_frame
 from jaxpose.slam.tracking.register import Tracked
 from jaxpose.slam.tracking.relocalise import CENTRES, FOUND_SIGMA
 from jaxpose.slam.types import Frames, Motion, SlamState, TrackingStatus
-
-_USUAL = 30  # frames that say what is usual
-_MATCHED = 3  # images that a frame's features are matched with
-_FIRST_SCALE = 30.0  # of the covariance of poses by features, before any has been compared: measured 6 to 200
-_CHI2_MEDIAN, _CHI2_999 = 5.35, 22.46  # of 6 degrees of freedom
-
-
-class MotionPrediction(NamedTuple):
-    """What is expected of the motion since the last frame, before this frame's image is looked at."""
-
-    dt: float  # [s]
-    timestamps: Float[np.ndarray, " k"]  # [s] since the last frame, up to dt
-    T_ref_body: Float[np.ndarray, "k 4 4"]
-    covariance: Float[np.ndarray, "6 6"]  # of it at dt, over right increments of the camera [m, rad]
-    support: Float[np.ndarray, "6 6"]  # the information in it that comes from features of this frame
-    readings: PreintegratedImu
-
-    @property
-    def sigma(self) -> Float[np.ndarray, "2"]:
-        """How far off [m, rad] it may be at dt, along the worst axis."""
-        return _worst_sigmas(self.covariance)
 
 
 def next_pose(
@@ -64,35 +44,41 @@ def next_pose(
     """The state with the pose of its last frame, which has none yet: registered, or predicted and marked."""
     config, policy, frames = state.config, state.config.recovery, state.frames
     predicted = _predict(state)
-    seen = None if features is None else _seen_pose(state, predicted, frame, features)
+    seen = None if features is None else seen_pose(state, predicted, frame, features)
     if seen is not None:
-        state, predicted = _with_features(state, predicted, seen)
+        state, predicted = with_features(state, predicted, seen)
         frames = state.frames
-    held = seen is not None and bool(max(_worst_sigmas(seen.covariance)) < policy.held_by_features)
+    held = seen is not None and bool(max(worst_sigmas(seen.covariance)) < policy.held_by_features)
     reach = _reach(state, predicted, held)
     if np.mean(frame.depth > 0) < policy.least_depth:
         return _update_state(state, frames, predicted, None, TrackingStatus.LOST)
     near_key, wide_key = jax.random.split(key)
+    used = predicted
     tracked = _track(state, frames, predicted, image, generator, near_key)
     lost = _failed(state, tracked, reach, held)
     if lost or (not held and _appearance_doubtful(state, tracked, predicted)):
         corrected, found = _relocalise(state, frame, image, predicted.T_ref_body[-1], reach, wide_key)
-        other = _track(state, corrected, _constant_velocity(predicted, found), image, generator, wide_key)
+        sigma = np.minimum(predicted.sigma, FOUND_SIGMA)
+        around = constant_velocity(predicted, found, np.diag(np.repeat(sigma**2, 3)))
+        other = _track(state, corrected, around, image, generator, wide_key)
         other_lost = _failed(state, other, reach, False)
         if lost or (not other_lost and _looks_better(policy, other, tracked)):
-            frames, tracked, lost = corrected, other, other_lost
+            frames, tracked, lost, used = corrected, other, other_lost, around
     unknown_place = lost and tracked.valid < config.track.minimum_valid
     if unknown_place and config.uses_accelerometer and max(reach) < policy.reckoned:
         return _update_state(state, state.frames, predicted, None, TrackingStatus.DEAD_RECKONED)
     if lost:
         return _update_state(state, state.frames, predicted, tracked, TrackingStatus.LOST)
     if seen is not None:
-        away = rigid.log(rigid.inverse(seen.T_world_cam) @ _T_world_cam(state, frames, tracked))
-        frames = frames.put(-1, feature_nis=away @ np.linalg.solve(seen.covariance, away) * _feature_scale(frames))
+        frames = frames.put(-1, feature_nis=feature_nis(state, frames, used, seen, tracked))
     status = TrackingStatus.TRACKED
     if (np.asarray(tracked.sigma) > policy.weak).any():
         status = TrackingStatus.WEAK
-    if not held and not is_blank(frame) and _is_appearance_outlier(policy, frames, float(tracked.colour_error)):
+    if (
+        not held
+        and not is_blank(frame)
+        and _is_appearance_outlier(policy, frames, float(tracked.colour_error))
+    ):
         status = TrackingStatus.APPEARANCE_OUTLIER
     return _update_state(state, frames, predicted, tracked, status)
 
@@ -124,88 +110,6 @@ def _predict(state: SlamState) -> MotionPrediction:
     return MotionPrediction(dt, timestamps, T_ref_body, covariance, np.zeros((6, 6)), readings)
 
 
-def _seen_pose(
-    state: SlamState, predicted: MotionPrediction, frame: Frame, features: Features
-) -> FeaturePose | None:
-    """The camera's pose by features of the last frame, unless it is in doubt, and of keyframes.
-
-    Keyframes are those that look the same way from near; after a loss, those that look alike. The covariance
-    is as many times larger as poses by features have been off so far.
-    """
-    frames, i = state.frames, state.frames.count - 1
-    T_world_cam, keyframes = frames.T_world_body @ state.T_body_cam, np.flatnonzero(frames.keyframe)
-    if frames.doubted[i - 1]:
-        before = []
-        order = np.argsort(np.mean((state.thumbnails - thumbnail(frame)) ** 2, axis=(1, 2, 3)))
-    else:
-        assert state.features is not None
-        before = [(state.features, T_world_cam[i - 1])]
-        T_predicted = frames.T_world_body[i - 1] @ predicted.T_ref_body[-1] @ state.T_body_cam
-        away = rigid.inverse(T_predicted) @ T_world_cam[keyframes]
-        near = [float(np.median(f.depth[f.depth > 0])) if (f.depth > 0).any() else 1.0 for f in state.keyframe_features]
-        off = np.linalg.norm(away[:, :3, 3], axis=1) / near
-        off = off + rigid.rotation_angle(away[:, :3, :3], np.eye(3))
-        order = np.argsort(np.where(keyframes == i - 1, np.inf, off))[: _MATCHED - 1]
-    chosen = [(state.keyframe_features[k], T_world_cam[keyframes[k]]) for k in order[:_MATCHED]]
-    seen = locate_camera(features, [*before, *chosen], state.camera)
-    return seen and seen._replace(covariance=seen.covariance * _feature_scale(frames))
-
-
-def _feature_scale(frames: Frames) -> float:
-    """How many times larger than stated the covariance of poses by features has been so far."""
-    known = frames.feature_nis[np.isfinite(frames.feature_nis)][-_USUAL:]
-    return max(float(np.median(known)) / _CHI2_MEDIAN, 1.0) if len(known) >= 5 else _FIRST_SCALE
-
-
-def _with_features(
-    state: SlamState, predicted: MotionPrediction, seen: FeaturePose
-) -> tuple[SlamState, MotionPrediction]:
-    """The prediction and the pose by features together, each by its information.
-
-    Where they contradict each other the features count alone. After a loss the frames in doubt are moved to
-    lead there.
-    """
-    frames, i, T_body_cam = state.frames, state.frames.count - 1, state.T_body_cam
-    support = np.linalg.inv(seen.covariance)
-    if frames.doubted[i - 1]:
-        last, T_predicted = _last_found(frames), frames.T_world_body[i - 1] @ predicted.T_ref_body[-1]
-        T_world_body = seen.T_world_cam @ rigid.inverse(T_body_cam)
-        frames = _distribute_correction(frames, last, rigid.inverse(T_predicted) @ T_world_body)
-        covariance, fused = seen.covariance, T_world_body
-    else:
-        T_predicted = frames.T_world_body[i - 1] @ predicted.T_ref_body[-1] @ T_body_cam
-        apart = rigid.log(rigid.inverse(seen.T_world_cam) @ T_predicted)
-        both = seen.covariance + predicted.covariance
-        expected = np.linalg.inv(predicted.covariance)
-        if apart @ np.linalg.solve(both, apart) > _CHI2_999:
-            expected = np.zeros((6, 6))
-        covariance = np.linalg.inv(support + expected)
-        fused = seen.T_world_cam @ rigid.exp(covariance @ expected @ apart) @ rigid.inverse(T_body_cam)
-    steady = _constant_velocity(predicted, rigid.inverse(frames.T_world_body[i - 1]) @ fused)
-    return state._replace(frames=frames), steady._replace(covariance=covariance, support=support)
-
-
-def _T_world_cam(state: SlamState, frames: Frames, tracked: Tracked) -> Float[np.ndarray, "4 4"]:
-    """The pose of the camera that a registration found."""
-    return frames.T_world_body[-2] @ np.asarray(tracked.T_ref_body, np.float64) @ state.T_body_cam
-
-
-def _worst_sigmas(covariance: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, "2"]:
-    """Standard deviations [m, rad] along the worst axes."""
-    return np.sqrt([np.linalg.eigvalsh(covariance[k : k + 3, k : k + 3])[-1] for k in (0, 3)])
-
-
-def _constant_velocity(predicted: MotionPrediction, found: Float[np.ndarray, "4 4"]) -> MotionPrediction:
-    """The prediction at one speed to a motion that a search has found."""
-    twist = rigid.log(found)
-    share = np.arange(1, len(predicted.timestamps) + 1) / len(predicted.timestamps)
-    T_ref_body = rigid.exp(share[:, None] * twist)
-    covariance = np.diag(np.repeat(np.minimum(predicted.sigma, FOUND_SIGMA) ** 2, 3))
-    return predicted._replace(
-        timestamps=predicted.dt * share, T_ref_body=T_ref_body, covariance=covariance, support=np.zeros((6, 6))
-    )
-
-
 def _update_state(
     state: SlamState,
     frames: Frames,
@@ -224,7 +128,7 @@ def _update_state(
     if tracked is not None:
         names = ("iterations", "loss", "depth_error", "colour_error", "valid", "sigma")
         values |= {name: getattr(tracked, name) for name in names}
-    sure = registered is not None and status <= TrackingStatus.WEAK and _last_found(frames) == i - 1
+    sure = registered is not None and status <= TrackingStatus.WEAK and frames.last_found == i - 1
     fade = np.exp(-dt / config.recovery.fading_s) if status == TrackingStatus.LOST else 1.0
     velocity_body = end_velocity(dt, T_ref_body, prediction.readings, speed=config.uses_accelerometer)
     motion = _observe_biases(state, T_ref_body, predicted, dt) if sure else state.motion
@@ -260,16 +164,11 @@ def _reach(state: SlamState, predicted: MotionPrediction, held: bool) -> np.ndar
     config, t, dt = state.config, state.frames.t, predicted.dt
     if held:
         return 3 * predicted.sigma
-    blind = t[-2] - t[_last_found(state.frames)]
+    blind = t[-2] - t[state.frames.last_found]
     metres = 0.05 * blind + 0.02 * blind**2 if config.uses_accelerometer else 0.25 * dt**2 + 0.3 * blind
     radians = 0.005 * blind if config.uses_gyroscope else 0.5 * dt**2 + 0.3 * blind
     reach = predicted.sigma + [metres, radians]
     return np.where(reach < config.recovery.farthest, reach, np.inf)
-
-
-def _last_found(frames: Frames) -> int:
-    """The last frame before the current one that is not in doubt."""
-    return int(np.flatnonzero(~frames.doubted[:-1])[-1])
 
 
 def _relocalise(
@@ -286,7 +185,7 @@ def _relocalise(
     """
     T_body_cam, frames, i = state.T_body_cam, state.frames, state.frames.count - 1
     T_world_predicted = frames.T_world_body[i - 1] @ predicted
-    last = _last_found(frames)
+    last = frames.last_found
     centres = [T_world_predicted]
     if last < i - 1:
         keyframes = np.flatnonzero(frames.keyframe)
@@ -309,17 +208,8 @@ def _relocalise(
         jax.random.fold_in(key, 1),
     )
     T_world_body = np.asarray(found, np.float64) @ rigid.inverse(T_body_cam)
-    frames = _distribute_correction(frames, last, rigid.inverse(T_world_predicted) @ T_world_body)
+    frames = frames.corrected(rigid.inverse(T_world_predicted) @ T_world_body)
     return frames, rigid.inverse(frames.T_world_body[i - 1]) @ T_world_body
-
-
-def _distribute_correction(frames: Frames, last: int, T_predicted_found: np.ndarray) -> Frames:
-    """The frames after `last` moved by their share of what the prediction at the current frame was off."""
-    i, t = frames.count - 1, frames.t
-    lost = np.arange(last + 1, i)
-    share = (t[lost] - t[last]) / (t[i] - t[last])
-    correction = rigid.exp(share[:, None] * rigid.log(T_predicted_found))
-    return frames.put(lost, T_world_body=frames.T_world_body[lost] @ correction)
 
 
 def _track(
@@ -415,7 +305,7 @@ def _is_appearance_outlier(policy: RecoveryConfig, frames: Frames, colour_error:
     Nothing is mapped from a wrong place. A light stays, so after a while it is taken as one, and what follows
     is held against the first frame in it.
     """
-    last = _last_found(frames)
+    last = frames.last_found
     usual = max(_usual_colour(frames), np.nan_to_num(frames.colour_error[last]), policy.least_colour)
     lately = frames.t[-1] - frames.t[last] < policy.other_light_s
     return bool(colour_error > policy.outlier_colour * usual and lately)

@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float, Int, Int8
 
 from jaxpose.datasets.types import Frame
 from jaxpose.fields import Params
+from jaxpose.geometry import rigid
 from jaxpose.geometry.camera import Camera
 from jaxpose.imu import Imu
 from jaxpose.scenes import GridConfig
@@ -71,12 +72,25 @@ class Frames(NamedTuple):
         """Anything but registered with every direction held by the image."""
         return self.status != TrackingStatus.TRACKED
 
+    @property
+    def last_found(self) -> int:
+        """The last frame before the current one that is not in doubt."""
+        return int(np.flatnonzero(~self.doubted[:-1])[-1])
+
     def put(self, i: int | Int[np.ndarray, " k"], **values) -> "Frames":
         """The same with other values at a frame, or at some."""
         changed = {name: getattr(self, name).copy() for name in values}
         for name, value in values.items():
             changed[name][i] = value
         return self._replace(**changed)
+
+    def corrected(self, T_predicted_found: Float[np.ndarray, "4 4"]) -> "Frames":
+        """The frames in doubt moved by their share of what the prediction at the current frame was off."""
+        last, i, t = self.last_found, self.count - 1, self.t
+        lost = np.arange(last + 1, i)
+        share = (t[lost] - t[last]) / (t[i] - t[last])
+        correction = rigid.exp(share[:, None] * rigid.log(T_predicted_found))
+        return self.put(lost, T_world_body=self.T_world_body[lost] @ correction)
 
     def appended(self, t: float) -> "Frames":
         """One more frame at `t` [s], of which nothing is known yet."""

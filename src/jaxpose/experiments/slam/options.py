@@ -124,6 +124,8 @@ class Options:
             check_unused(self, names, f"{why}, but in the frame intrinsic")
             if slam.frame != "anchored":
                 raise ValueError(f"--frame {slam.frame}: expected --track.method gradient with it")
+        if slam.track.method == "gradient":
+            check_unused(self, ("slam.features",), "with --track.method gradient")
         if slam.track.method == "gauss_newton":
             check_unused(
                 self, [f"slam.track.{n}" for n in _RENDERED_TRACKING], "with --track.method gauss_newton"

@@ -1,6 +1,6 @@
 """Sparse features: the camera's pose by corners that earlier frames have seen, whatever map there is.
 
-Corners of a pyramid, spread over the image, described by ORB (Rublee et al. 2011) and matched by the ratio test
+Corners of a pyramid, spread over the image, described by ORB (Rublee et al. 2011), matched by the ratio test
 (Lowe 2004); the pose by RANSAC over three-point solutions (Ke and Roumeliotis 2017), refined by reweighted
 least squares of the reprojection errors, whose spread is their noise. Detection, description, matching and
 RANSAC are OpenCV's.
@@ -30,10 +30,14 @@ _OUTLIER = 3.0  # sigmas of reprojection, in the end
 _LEAST_NOISE = 0.3  # [px] of the finest level
 _INDEPENDENT = 50.0  # features: errors of depth and of intrinsics go together
 _STEPS = 10
+_SETTLED = 1e-7  # [m, rad]
+_NEAREST = 1e-3  # [m] in front of the camera
+_SINGULAR = 1e12  # condition of an information that leaves some direction open
+_MEDIAN_LENGTH = 1.177  # of a vector in the plane, normal in both directions, in sigmas
 
 
 class Features(NamedTuple):
-    """Corners of one image: where they point to, how far away they are, how coarse, and what they look like."""
+    """Corners of an image: where they point to, how far away and how coarse they are, what they look like."""
 
     direction_cam: Float[np.ndarray, "n 3"]  # z = 1
     depth: Float[np.ndarray, " n"]  # [m] along the optical axis; 0 where there is none
@@ -44,6 +48,12 @@ class Features(NamedTuple):
     def points_cam(self) -> Float[np.ndarray, "n 3"]:
         """Where they are, in camera axes [m]; the camera's centre for those without depth."""
         return self.direction_cam * self.depth[:, None]
+
+    @property
+    def usual_depth(self) -> float:
+        """The median of the depths that are known [m]; 1 without any."""
+        known = self.depth[self.depth > 0]
+        return float(np.median(known)) if len(known) else 1.0
 
 
 class FeaturePose(NamedTuple):
@@ -143,7 +153,10 @@ def _matches(a: Features, b: Features) -> tuple[Int[np.ndarray, " m"], Int[np.nd
 
 
 def _pose(
-    point: Float[np.ndarray, "n 3"], xy: Float[np.ndarray, "n 2"], sigma: Float[np.ndarray, " n"], focal: float
+    point: Float[np.ndarray, "n 3"],
+    xy: Float[np.ndarray, "n 2"],
+    sigma: Float[np.ndarray, " n"],
+    focal: float,
 ) -> FeaturePose | None:
     """The pose of a camera that sees world points at `xy` (z = 1), each known to `sigma` by its scale."""
     cv2 = _opencv()
@@ -160,42 +173,63 @@ def _pose(
     refined = _refine(T, point - centre, xy, sigma)
     if refined is None:
         return None
-    T, covariance, inliers = refined
-    T[:3, 3] += centre
-    return FeaturePose(T, covariance * max(inliers / _INDEPENDENT, 1), inliers)
+    refined.T_world_cam[:3, 3] += centre
+    return refined
 
 
-def _refine(T, point, xy, sigma):
-    """The pose of least reprojection error (Geman and McClure's), its covariance and inliers; None of too few."""
+class _Reprojection(NamedTuple):
+    """How far, in sigmas, points are from where they are seen; infinite behind the camera."""
+
+    size: Float[np.ndarray, " n"]
+    residual: Float[np.ndarray, "n 2"]  # 0 behind the camera
+    by_pose: Float[np.ndarray, "n 2 6"]  # derivative by right increments of the pose
+
+
+def _reproject(
+    T: Float[np.ndarray, "4 4"],
+    point: Float[np.ndarray, "n 3"],
+    xy: Float[np.ndarray, "n 2"],
+    sigma: Float[np.ndarray, " n"],
+) -> _Reprojection:
+    point_cam = rigid.apply(rigid.inverse(T), point)
+    front = point_cam[:, 2] > _NEAREST
+    depth = np.where(front, point_cam[:, 2], 1.0)
+    seen = point_cam[:, :2] / depth[:, None]
+    residual = np.where(front[:, None], (seen - xy) / sigma[:, None], 0)
+    change = np.zeros((len(point), 2, 3))  # of the residual by the point in camera axes
+    change[:, 0, 0] = change[:, 1, 1] = 1
+    change[:, :, 2] = -seen
+    change /= (depth * sigma)[:, None, None]
+    by_pose = np.concatenate([-change, np.cross(change, point_cam[:, None])], axis=-1)
+    return _Reprojection(np.where(front, np.linalg.norm(residual, axis=1), np.inf), residual, by_pose)
+
+
+def _refine(
+    T: Float[np.ndarray, "4 4"],
+    point: Float[np.ndarray, "n 3"],
+    xy: Float[np.ndarray, "n 2"],
+    sigma: Float[np.ndarray, " n"],
+) -> FeaturePose | None:
+    """The pose of least reprojection error (robust, Geman and McClure 1985); None where too few agree."""
+    noise = 1.0
     for _ in range(_STEPS):
-        point_cam = rigid.apply(rigid.inverse(T), point)
-        front = point_cam[:, 2] > 1e-3
-        depth = np.where(front, point_cam[:, 2], 1.0)
-        seen = point_cam[:, :2] / depth[:, None]
-        residual = (seen - xy) / sigma[:, None]
-        size = np.where(front, np.linalg.norm(residual, axis=1), np.inf)
-        if not (size < 5 * _OUTLIER).any():
+        at = _reproject(T, point, xy, sigma)
+        near = at.size < 5 * _OUTLIER
+        if near.sum() < FEWEST:
             return None
-        # The median length of a normal vector in the plane is 1.177 sigmas.
-        noise = max(float(np.median(size[size < 5 * _OUTLIER])) / 1.177, _LEAST_NOISE)
-        weight = 1 / (1 + (size / (_OUTLIER * noise)) ** 2) ** 2
-        change = np.zeros((len(point), 2, 3))  # of the residual by the point in camera axes
-        change[:, 0, 0] = change[:, 1, 1] = 1
-        change[:, :, 2] = -seen
-        change /= (depth * sigma)[:, None, None]
-        by_pose = np.concatenate([-change, np.cross(change, point_cam[:, None])], axis=-1)
-        information = np.einsum("n,nki,nkj->ij", weight, by_pose, by_pose)
-        descent = np.einsum("n,nki,nk->i", weight, by_pose, np.where(front[:, None], residual, 0))
-        if np.linalg.cond(information) > 1e12:
+        noise = max(float(np.median(at.size[near])) / _MEDIAN_LENGTH, _LEAST_NOISE)
+        weight = 1 / (1 + (at.size / (_OUTLIER * noise)) ** 2) ** 2
+        information = np.einsum("n,nki,nkj->ij", weight, at.by_pose, at.by_pose)
+        if np.linalg.cond(information) > _SINGULAR:
             return None
-        step = -np.linalg.solve(information, descent)
+        step = -np.linalg.solve(information, np.einsum("n,nki,nk->i", weight, at.by_pose, at.residual))
         T = T @ rigid.exp(step)
-        if np.linalg.norm(step) < 1e-7:
+        if np.linalg.norm(step) < _SETTLED:
             break
-    inlier = size < _OUTLIER * noise
-    if inlier.sum() < FEWEST:
+    at = _reproject(T, point, xy, sigma)
+    inlier = at.size < _OUTLIER * noise
+    information = np.einsum("nki,nkj->ij", at.by_pose[inlier], at.by_pose[inlier])
+    if inlier.sum() < FEWEST or np.linalg.cond(information) > _SINGULAR:
         return None
-    information = np.einsum("nki,nkj->ij", by_pose[inlier], by_pose[inlier])
-    if np.linalg.cond(information) > 1e12:
-        return None
-    return T, noise**2 * np.linalg.inv(information), int(inlier.sum())
+    together = max(float(inlier.sum()) / _INDEPENDENT, 1.0)
+    return FeaturePose(T, noise**2 * together * np.linalg.inv(information), int(inlier.sum()))

@@ -86,8 +86,9 @@ def make_gradient(
         T_ref_body = framed.motion(params, problem.reference_frame)(problem.t)
         exposure, unknown = jnp.asarray(image.exposure), jnp.full(2, jnp.nan)
         return Tracked(
-            T_ref_body, params, total, depth_error, colour_error, exposure, valid, iterations, unknown
-        )
+            T_ref_body, params, total, depth_error, colour_error, exposure, valid, iterations, unknown,
+            jnp.zeros((6, 6)),
+        )  # fmt: skip
 
     return step
 

@@ -21,6 +21,22 @@ _SMALLEST_WINDOW = 16  # readings; windows are padded to powers of two, so that 
 FIELD_SIGMAS = ResidualSigmas(loose=0.004, tight=0.1, accelerometer=1.0)
 
 
+class MotionPrediction(NamedTuple):
+    """What is expected of the motion since the last frame, before this frame's image is looked at."""
+
+    dt: float  # [s]
+    timestamps: Float[np.ndarray, " k"]  # [s] since the last frame, up to dt
+    T_ref_body: Float[np.ndarray, "k 4 4"]
+    covariance: Float[np.ndarray, "6 6"]  # of it at dt, over right increments of the camera [m, rad]
+    support: Float[np.ndarray, "6 6"]  # the information in it that comes from features of this frame
+    readings: "PreintegratedImu"
+
+    @property
+    def sigma(self) -> Float[np.ndarray, "2"]:
+        """How far off [m, rad] it may be at dt, along the worst axis."""
+        return worst_sigmas(self.covariance)
+
+
 class TrackingProblem(NamedTuple):
     """What is known of the motion since the last frame (`ref`) before this frame's image is looked at."""
 
@@ -150,6 +166,29 @@ def prediction_sigma(
         0.015 + 0.1 * t**2 if speed else 0.4 * distance + 0.01,
         0.004 + gyro_bias_sigma * t if rotation else 0.4 * angle + 0.01,
     ])  # fmt: skip
+
+
+def constant_velocity(
+    predicted: MotionPrediction,
+    found: Float[np.ndarray, "4 4"],
+    covariance: Float[np.ndarray, "6 6"],
+    support: Float[np.ndarray, "6 6"] | None = None,
+) -> MotionPrediction:
+    """The prediction at one speed to a motion found otherwise, with its covariance and support."""
+    twist = rigid.log(found)
+    share = np.arange(1, len(predicted.timestamps) + 1) / len(predicted.timestamps)
+    T_ref_body = rigid.exp(share[:, None] * twist)
+    return predicted._replace(
+        timestamps=predicted.dt * share,
+        T_ref_body=T_ref_body,
+        covariance=covariance,
+        support=np.zeros((6, 6)) if support is None else support,
+    )
+
+
+def worst_sigmas(covariance: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, "2"]:
+    """Standard deviations [m, rad] along the worst axes."""
+    return np.sqrt([np.linalg.eigvalsh(covariance[k : k + 3, k : k + 3])[-1] for k in (0, 3)])
 
 
 def end_velocity(t: float, T_ref_body: np.ndarray, readings: PreintegratedImu, *, speed: bool) -> np.ndarray:

@@ -42,6 +42,7 @@ class Tracked(NamedTuple):
     valid: Float[Array, ""]  # share of pixels with depth that the map explains
     iterations: Int[Array, ""]
     sigma: Float[Array, "2"]  # [m, rad] of the pose, by what the image says of it; NaN: not known
+    information: Float[Array, "6 6"]  # of the image alone, over right increments of the camera; 0: not known
 
 
 @runtime_checkable
@@ -222,10 +223,14 @@ def register(
 
 def pose_sigma(found: Registration, support: Float[Array, "6 6"]) -> Float[Array, "2"]:
     """Standard deviation [m, rad] of an aligned pose along its worst axis, by the image and its features."""
-    information = found.information / _weight(found.residuals) + support
-    covariance = jnp.linalg.inv(information + 1e-6 * jnp.eye(6))
+    covariance = jnp.linalg.inv(image_information(found) + support + 1e-6 * jnp.eye(6))
     worst = lambda block: jnp.sqrt(jnp.linalg.eigvalsh(block)[-1])
     return jnp.stack([worst(covariance[:3, :3]), worst(covariance[3:, 3:])])
+
+
+def image_information(found: Registration) -> Float[Array, "6 6"]:
+    """What an image says of its pose, counted as `_INDEPENDENT` pixels."""
+    return found.information / _weight(found.residuals)
 
 
 def _weight(found: Residuals) -> Float[Array, ""]:
@@ -257,6 +262,7 @@ def make_register(sample_map: MapQuery, camera: Camera, config: TrackConfig) -> 
             residuals.valid,
             found.iterations,
             pose_sigma(found, problem.support),
+            image_information(found),
         )
 
     return step
