@@ -126,8 +126,6 @@ def test_features_are_spread_over_the_image():
     strong = [cv2.KeyPoint(*xy, 31, -1, 2 + r) for *xy, r in rng.uniform(0, [39, 39, 1], (2000, 3)).tolist()]
     places = rng.uniform([40, 40, 0], [320, 240, 1], (500, 3)).tolist()
     weak = [cv2.KeyPoint(*xy, 31, -1, r) for *xy, r in places]
-        cv2.KeyPoint(*xy, 31, -1, r) for *xy, r in rng.uniform([40, 40, 0], [320, 240, 1], (500, 3)).tolist()
-    ]
     chosen = features._spread([*strong, *weak], (240, 320))
     assert len(chosen) == 1000
     kept = {k.response for k in chosen}
