@@ -27,12 +27,13 @@ from jaxpose.slam.keyframes import FrameReader, keyframe_images, thumbnail
 from jaxpose.slam.map.backend import (
     framed_field,
     grow_to_fit,
+    is_mapped,
     map_frame,
     scene_params,
     seen_points,
 )
 from jaxpose.slam.map.texture import Texture, make_texture, textured
-from jaxpose.slam.observation import is_blank, to_device
+from jaxpose.slam.observation import to_device
 from jaxpose.slam.tracker import next_pose
 from jaxpose.slam.tracking.features import detect
 from jaxpose.slam.tracking.intrinsic_frame import is_due, make_refit, window
@@ -40,7 +41,6 @@ from jaxpose.slam.tracking.predict import GYRO_BIAS_SIGMA
 from jaxpose.slam.types import Frames, Motion, SlamState, no_frames
 
 _DEFAULT = SlamConfig()
-_VIEW_CHANGE = 0.1  # of the angle of view, after which a frame is mapped
 _KEPT_S = 0.1  # of readings before the last frame, so that they can be interpolated there
 
 
@@ -258,7 +258,7 @@ def _advance(state: SlamState, frame: Frame, t: float, imu: Imu | None, read: Fr
     points = seen_points(frame, state.camera, T_world_cam)
     if i == 0 and len(points) == 0:
         raise DataError("expected depth in the first frame, found none")
-    if len(points) == 0 or not _is_mapped(state, frame):
+    if len(points) == 0 or not is_mapped(state, frame):
         return state
     away = np.linalg.norm(points - T_world_cam[:3, 3], axis=1)
     state = state._replace(max_depth=max(state.max_depth, 1.2 * float(np.percentile(away, 99))))
@@ -280,27 +280,6 @@ def _first_pose(state: SlamState) -> SlamState:
     return state._replace(
         frames=state.frames.put(0, T_world_body=T_world_cam @ rigid.inverse(state.T_body_cam))
     )
-
-
-def _is_mapped(state: SlamState, frame: Frame) -> bool:
-    """Whether the last frame is to be mapped: not where its pose or its colour is in doubt."""
-    config, frames, i = state.config, state.frames, state.frames.count - 1
-    held_out = config.hold_out > 0 and i % config.hold_out == config.hold_out - 1
-    mapped = np.flatnonzero(frames.mapped)
-    if held_out or frames.doubted[i] or not len(mapped):
-        return not held_out and not frames.doubted[i]
-    unconfirmed = frames.lost[i - 1] and not config.uses_accelerometer
-    last = mapped[-1]
-    due = frames.t[i] - frames.t[last] >= config.map_every_s or _view_changed(state, frame, last)
-    return bool(not unconfirmed and not is_blank(frame) and due)
-
-
-def _view_changed(state: SlamState, frame: Frame, since: int) -> bool:
-    """Whether the image has moved by a tenth of its view since a frame, whatever the clock says."""
-    away = rigid.inverse(state.frames.T_world_body[since]) @ state.frames.T_world_body[-1]
-    near = float(np.median(frame.depth[frame.depth > 0]))
-    moved = np.linalg.norm(away[:3, 3]) / near + rigid.rotation_angle(np.eye(3), away[:3, :3])
-    return bool(moved > _VIEW_CHANGE * angle_of_view(state.camera)[0])
 
 
 def _update_intrinsic_frame(state: SlamState) -> SlamState:

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxpose.datasets.types import Frame
 from jaxpose.geometry import rigid
-from jaxpose.geometry.camera import Camera, pixel_grid, unproject_numpy
+from jaxpose.geometry.camera import Camera, angle_of_view, pixel_grid, unproject_numpy
 from jaxpose.scenes import GridConfig, SceneField, bounding_grid, grid, grow, merge
 from jaxpose.scenes.types import Params
 from jaxpose.scenes.voxel_blocks import BlockConfig, empty_blocks, voxel_blocks
@@ -20,7 +20,7 @@ from jaxpose.slam.config import IMU_WEIGHTS, ImuWeights, MapConfig, SlamConfig, 
 from jaxpose.slam.keyframes import FrameReader, choose, keyframe_images, overlap
 from jaxpose.slam.map.integrate import MapSample, grown_map, make_integrate, sample_map
 from jaxpose.slam.map.photometric import MapState, make_descend
-from jaxpose.slam.observation import Image, sample_pixels
+from jaxpose.slam.observation import Image, is_blank, sample_pixels
 from jaxpose.slam.tracking.gradient import make_gradient
 from jaxpose.slam.tracking.reference_frames import FramedField, make_field
 from jaxpose.slam.tracking.register import TrackStep, make_register
@@ -28,6 +28,7 @@ from jaxpose.slam.tracking.relocalise import relocalise
 from jaxpose.slam.types import SlamState
 
 _SEARCHED_WITH = 400  # pixels
+_VIEW_CHANGE = 0.1  # of the angle of view, after which a frame is mapped
 _ALLOCATION_COLUMNS = 160  # of an image, by whose depth blocks are made: closer than a block is wide
 
 
@@ -159,6 +160,27 @@ def grow_to_fit(frame: Frame, points: Float[np.ndarray, "n 3"], state: SlamState
         return state
     larger, grown = grow(state.grid, state.map, bounds)
     return state._replace(grid=larger, map=grown)
+
+
+def is_mapped(state: SlamState, frame: Frame) -> bool:
+    """Whether the last frame is to be mapped: not where its pose or its colour is in doubt."""
+    config, frames, i = state.config, state.frames, state.frames.count - 1
+    held_out = config.hold_out > 0 and i % config.hold_out == config.hold_out - 1
+    mapped = np.flatnonzero(frames.mapped)
+    if held_out or frames.doubted[i] or not len(mapped):
+        return not held_out and not frames.doubted[i]
+    unconfirmed = frames.lost[i - 1] and not config.uses_accelerometer
+    last = int(mapped[-1])
+    due = frames.t[i] - frames.t[last] >= config.map_every_s or _view_changed(state, frame, last)
+    return bool(not unconfirmed and not is_blank(frame) and due)
+
+
+def _view_changed(state: SlamState, frame: Frame, since: int) -> bool:
+    """Whether the image has moved by a tenth of its view since a frame, whatever the clock says."""
+    away = rigid.inverse(state.frames.T_world_body[since]) @ state.frames.T_world_body[-1]
+    near = float(np.median(frame.depth[frame.depth > 0]))
+    moved = np.linalg.norm(away[:3, 3]) / near + rigid.rotation_angle(np.eye(3), away[:3, :3])
+    return bool(moved > _VIEW_CHANGE * angle_of_view(state.camera)[0])
 
 
 def map_frame(
