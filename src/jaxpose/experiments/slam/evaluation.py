@@ -21,6 +21,7 @@ from jaxpose.imu import Imu, remove_gravity
 from jaxpose.slam import SlamResult
 
 _MOST_READINGS = 4000  # compared with the field; more are thinned
+_WRONG_M, _WRONG_DEG = 0.10, 5.0  # a pose that is farther off is wrong, and should be marked
 _MAP_FRAMES = 10  # of each kind that the map is measured at
 MAP_PROTOCOL = (
     f"map rendered from estimated poses of at most {_MAP_FRAMES} frames of each kind, about {VIEW_WIDTH} px "
@@ -125,6 +126,7 @@ def accuracy(
     ate = trajectory_error.ate(result.T_world_cam, T_world_true)
     aligned = trajectory_error.align(ate.alignment, result.T_world_cam)
     rotation_deg = np.degrees(rigid.rotation_angle(aligned[:, :3, :3], T_world_true[:, :3, :3]))
+    wrong = (ate.errors > _WRONG_M) | (rotation_deg > _WRONG_DEG)  # NaN, without ground truth, is neither
     field = jax.jit(jax.vmap(result.field.pose, (None, 0)))
     since_first = jnp.asarray(t - t[0], jnp.float32)
     field_poses = np.asarray(field(result.field_params, since_first), np.float64)
@@ -134,6 +136,8 @@ def accuracy(
         "ate_max_m": ate.max,
         "rotation_rmse_deg": trajectory_error.statistics(rotation_deg).rmse,
         "frames_with_ground_truth": ate.frames,
+        "frames_wrong": int(wrong.sum()),
+        "frames_wrong_and_marked": int((wrong & result.frames.uncertain).sum()),
         "rpe": _drift(result.T_world_cam, T_world_true),
         "field_ate_rmse_m": trajectory_error.ate(field_poses, T_world_true).rmse,
     }
