@@ -137,19 +137,13 @@ def _matches(a: Features, b: Features) -> tuple[Int[np.ndarray, " m"], Int[np.nd
     cv2, none = _opencv(), np.zeros(0, int)
     if len(a.depth) < 2 or len(b.depth) < 2:
         return none, none
-    found = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(a.descriptor, b.descriptor, k=2)
-    pairs = [
-        (best.queryIdx, best.trainIdx, best.distance)
-        for best, second in found
-        if best.distance < _RATIO * second.distance
-    ]
-    if not pairs:
-        return none, none
-    i, j, distance = np.array(pairs).T
-    order = np.argsort(distance, kind="stable")
-    _, first = np.unique(j[order], return_index=True)
-    kept = order[np.sort(first)]
-    return i[kept].astype(int), j[kept].astype(int)
+    distance, nearest = cv2.batchDistance(
+        a.descriptor, b.descriptor, cv2.CV_32S, normType=cv2.NORM_HAMMING, K=2
+    )
+    i = np.flatnonzero(distance[:, 0] < _RATIO * distance[:, 1])
+    i = i[np.argsort(distance[i, 0], kind="stable")]
+    j, first = np.unique(nearest[i, 0], return_index=True)
+    return i[first], j
 
 
 def _pose(
