@@ -30,7 +30,7 @@ _OUTLIER = 3.0  # sigmas of reprojection, in the end
 _LEAST_NOISE = 0.3  # [px] of the finest level
 _INDEPENDENT = 50.0  # features: errors of depth and of intrinsics go together
 _STEPS = 10
-_SETTLED = 1e-7  # [m, rad]
+_SETTLED = 1e-6  # [m, rad]
 _NEAREST = 1e-3  # [m] in front of the camera
 _SINGULAR = 1e12  # condition of an information that leaves some direction open
 _MEDIAN_LENGTH = 1.177  # of a vector in the plane, normal in both directions, in sigmas
@@ -213,16 +213,19 @@ def _refine(
             return None
         noise = max(float(np.median(at.size[near])) / _MEDIAN_LENGTH, _LEAST_NOISE)
         weight = 1 / (1 + (at.size / (_OUTLIER * noise)) ** 2) ** 2
-        information = np.einsum("n,nki,nkj->ij", weight, at.by_pose, at.by_pose)
+        rows = at.by_pose.reshape(-1, 6)
+        weighted = rows * np.repeat(weight, 2)[:, None]
+        information = weighted.T @ rows
         if np.linalg.cond(information) > _SINGULAR:
             return None
-        step = -np.linalg.solve(information, np.einsum("n,nki,nk->i", weight, at.by_pose, at.residual))
+        step = -np.linalg.solve(information, weighted.T @ at.residual.reshape(-1))
         T = T @ rigid.exp(step)
         if np.linalg.norm(step) < _SETTLED:
             break
     at = _reproject(T, point, xy, sigma)
     inlier = at.size < _OUTLIER * noise
-    information = np.einsum("nki,nkj->ij", at.by_pose[inlier], at.by_pose[inlier])
+    rows = at.by_pose[inlier].reshape(-1, 6)
+    information = rows.T @ rows
     if inlier.sum() < FEWEST or np.linalg.cond(information) > _SINGULAR:
         return None
     together = max(float(inlier.sum()) / _INDEPENDENT, 1.0)
