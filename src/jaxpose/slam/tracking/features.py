@@ -20,7 +20,7 @@ from jaxpose.geometry.camera import Camera, unproject_numpy
 
 FEWEST = 12  # inliers of a pose that is believed: at random, three points and a few more agree now and then
 
-_MOST = 1000  # features of an image
+_MOST = 700  # features of an image
 _ROWS, _COLUMNS = 6, 8  # of cells that they are spread over
 _CONTRAST = 7  # [grey levels] by which a corner stands out
 _PYRAMID = (1.2, 8)  # from level to level, and levels
@@ -65,7 +65,7 @@ class FeaturePose(NamedTuple):
 
 
 def detect(frame: Frame, camera: Camera) -> Features:
-    """The corners of a frame, at most about a thousand."""
+    """The corners of a frame, the strongest of each part of it."""
     cv2 = _opencv()
     grey = cv2.cvtColor(np.ascontiguousarray(frame.rgb), cv2.COLOR_RGB2GRAY)
     keypoints, descriptor = _detector().compute(grey, _spread(_detector().detect(grey, None), grey.shape))
