@@ -40,7 +40,9 @@ def seen_pose(
         away = rigid.inverse(T_predicted) @ T_world_cam[keyframes]
         off = np.linalg.norm(away[:, :3, 3], axis=1) / [f.usual_depth for f in state.keyframe_features]
         off = off + rigid.rotation_angle(away[:, :3, :3], np.eye(3))
-        order = np.argsort(np.where(keyframes == i - 1, np.inf, off))[: _MATCHED - 1]
+        order = np.argsort(off)[: _MATCHED - 1]
+        if i - 1 in keyframes[order]:
+            before = []  # it is among them
     chosen = [(state.keyframe_features[k], T_world_cam[keyframes[k]]) for k in order[:_MATCHED]]
     seen = locate_camera(features, chosen, state.camera)
     if before and (seen is None or seen.inliers < _ENOUGH):
