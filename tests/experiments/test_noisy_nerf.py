@@ -295,20 +295,28 @@ def test_unknown_poses_start_before_the_middle_of_disparity(data_dir):
     assert_allclose(problem.T_start[:, :3, 3], [[0, 0, -2]] * 8, rtol=1e-6)  # of disparities 1 to 0
 
 
+def fern_from_nothing(data_dir, folder, steps):
+    settings = Config(
+        data=data_dir / "llff_fern", noise="unknown", steps=steps, test_pose_steps=0, out=folder
+    )
+    results = noisy_nerf.run(settings).results
+    assert results["start"]["translation_error_percent"] > 25
+    return results
+
+
 @pytest.mark.data
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("steps", "degrees", "percent"),
-    [
-        (1000, 180.0, 15.0),  # the turns come later: 76 to 94 degrees at 1000 steps, 8 at 1600, 3 at 5000
-        pytest.param(5000, 6.0, 2.5, marks=pytest.mark.hour),
-    ],
-)
-def test_unknown_poses_of_a_forward_facing_scene_are_found(data_dir, tmp_path, steps, degrees, percent):
-    config = Config(data=data_dir / "llff_fern", noise="unknown", steps=steps, test_pose_steps=0, out=tmp_path)
-    results = noisy_nerf.run(config).results
-    assert results["start"]["translation_error_percent"] > 25
-    assert results["translation_error_percent"] < percent and results["rotation_error_deg"] <= degrees
+def test_unknown_places_of_a_forward_facing_scene_are_found_first(data_dir, tmp_path):
+    """Not how cameras are turned: that is 76 to 94 degrees off at 1000 steps, 8 at 1600, 3 at 5000."""
+    assert fern_from_nothing(data_dir, tmp_path, 1000)["translation_error_percent"] < 15
+
+
+@pytest.mark.data
+@pytest.mark.slow
+@pytest.mark.hour
+def test_unknown_poses_of_a_forward_facing_scene_are_found(data_dir, tmp_path):
+    results = fern_from_nothing(data_dir, tmp_path, 5000)
+    assert results["translation_error_percent"] < 2.5 and results["rotation_error_deg"] < 6
 
 
 # --- what is not possible --------------------------------------------------------------------------------
