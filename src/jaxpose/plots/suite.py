@@ -34,4 +34,5 @@ def accuracy(path: Path | str, rows: Sequence[dict[str, Any]]) -> None:
         axes.set_xscale("log")
         axes.set_xlabel("ATE [cm], median and range over the seeds; red: frames lost or runs failed")
         axes.xaxis.set_major_formatter("{x:g}")
+        axes.xaxis.set_minor_formatter("{x:g}")
         save(figure, path)
