@@ -4,6 +4,7 @@ import json
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,6 +27,30 @@ def test_every_recording_at_every_rate_and_every_sensor(tmp_path):
         ("desk", "all"), ("desk", "5 Hz"), ("desk", "2.5 Hz"),
         ("room, stipple", "5 Hz"),
     ]  # fmt: skip
+
+
+def test_recordings_of_one_name_are_told_apart():
+    found = [case.recording for case in cases(Config(data=(Path("a/seq-01"), Path("b/seq-01")), sensors=()))]
+    assert found == ["a/seq-01", "b/seq-01"]
+
+
+def test_an_interrupted_suite_leaves_no_run_behind(tmp_path, monkeypatch):
+    """What is running ends at once, and what waits is never started."""
+    started = []
+
+    class Endless(subprocess.Popen):
+        def __init__(self, command, **options):
+            super().__init__([sys.executable, "-c", "import time; time.sleep(600)"], **options)
+            started.append(self)
+
+    def interrupt(seconds):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(suite.subprocess, "Popen", Endless)
+    monkeypatch.setattr(suite.time, "sleep", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        suite.run(Config(sensors=("axial",), processes=2, out=tmp_path / "suite"))
+    assert len(started) == 2 and all(process.wait(10) != 0 for process in started)
 
 
 def test_the_table_shows_ranges_and_failures():

@@ -10,14 +10,12 @@ import os
 import re
 import subprocess
 import sys
-import threading
+import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from typing import IO, Any, NamedTuple, get_args
 
 import numpy as np
 
@@ -34,6 +32,7 @@ GROUPS = {
     "what": ("data", "rates_hz", "sensors", "seeds", "smoke"),
     "run": ("out", "name", "resume", "processes", "json"),
 }
+_POLL_S = 0.2
 _HEAD = ("recording", "rate", "ATE [cm]", "RPE [cm]", "lost", "uncertain", "wrong told", "s/frame", "MB")
 
 
@@ -85,10 +84,12 @@ def cases(config: Config) -> Iterator[Case]:
     Returns:
         Each recording at all frames and at each rate, then the room with each sensor.
     """
-    for folder in config.data:
-        yield Case(folder.name, "all", ("--data", str(folder)))
+    names = [folder.resolve().name for folder in config.data]
+    for folder, name in zip(config.data, names, strict=True):
+        recording = name if names.count(name) == 1 else str(folder)
+        yield Case(recording, "all", ("--data", str(folder)))
         for rate_hz in config.rates_hz:
-            yield Case(folder.name, f"{rate_hz:g} Hz", ("--data", str(folder), "--rate-hz", f"{rate_hz:g}"))
+            yield Case(recording, f"{rate_hz:g} Hz", ("--data", str(folder), "--rate-hz", f"{rate_hz:g}"))
     for sensor in config.sensors:
         yield Case(f"room, {sensor.replace('_', ' ')}", "5 Hz", ("--room.sensor", sensor))
 
@@ -125,19 +126,23 @@ def run(config: Config, on_update: OnUpdate = silent) -> Outcome:
 
 
 def _run_all(config: Config, todo: list[Case], folder: Path, on_update: OnUpdate) -> list[Row]:
-    """Every case with every seed, as many at once as the config says."""
+    """Every case with every seed, as many at once as the config says; none goes on without this one."""
+    waiting = [(case, seed) for case in todo for seed in range(config.seeds)]
+    total, running = len(waiting), {}
     found: dict[tuple[Case, int], dict[str, Any] | str] = {}
-    with _children() as children, ThreadPoolExecutor(config.processes) as pool:
-        jobs = {
-            pool.submit(_run_one, config, case, seed, folder / "runs", children): (case, seed)
-            for case in todo
-            for seed in range(config.seeds)
-        }
-        for job in as_completed(jobs):
-            found[jobs[job]] = job.result()
-            case, seed = jobs[job]
-            last = {"last": f"{case.recording}, {case.rate}, seed {seed}"}
-            on_update(Update("tracking", len(found), len(jobs), "runs", last))
+    try:
+        while waiting or running:
+            while waiting and len(running) < config.processes:
+                run = waiting.pop(0)
+                running[run] = _start(config, *run, folder / "runs")
+            for run in [run for run, started in running.items() if started.process.poll() is not None]:
+                found[run] = _ended(running.pop(run))
+                last = {"last": f"{run[0].recording}, {run[0].rate}, seed {run[1]}"}
+                on_update(Update("tracking", len(found), total, "runs", last))
+            time.sleep(_POLL_S)
+    finally:
+        for started in running.values():
+            started.process.kill()
     rows = []
     for case in todo:
         of_case = [found[case, seed] for seed in range(config.seeds)]
@@ -146,41 +151,29 @@ def _run_all(config: Config, todo: list[Case], folder: Path, on_update: OnUpdate
     return rows
 
 
-@contextmanager
-def _children() -> Iterator[set[subprocess.Popen[str]]]:
-    """Processes that end with the block, also where it is interrupted."""
-    running: set[subprocess.Popen[str]] = set()
-    try:
-        yield running
-    except BaseException:
-        for process in tuple(running):
-            process.kill()
-        raise
+class _Started(NamedTuple):
+    process: subprocess.Popen[bytes]
+    out: Path
+    said: IO[bytes]  # what it says on stderr
 
 
-_starting = threading.Lock()
-
-
-def _run_one(
-    config: Config, case: Case, seed: int, runs: Path, children: set[subprocess.Popen[str]]
-) -> dict[str, Any] | str:
-    """The results of one run; one line where it ended without."""
-    label = re.sub(r"[^\w.]+", "-", f"{case.recording}-{case.rate}-{seed}")
-    out = runs / label
+def _start(config: Config, case: Case, seed: int, runs: Path) -> _Started:
+    out = runs / re.sub(r"[^\w.]+", "-", f"{case.recording}-{case.rate}-{seed}")
     command = [sys.executable, "-m", "jaxpose", "slam", "--imu", "none", *case.args, "--seed", str(seed)]
     command += ["--out", str(out), *(["--smoke"] if config.smoke else [])]
     command += ["--resume"] if config.resume and out.exists() else []
-    with _starting:
-        process = subprocess.Popen(
-            command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, encoding="utf-8"
-        )
-        children.add(process)
-    _, said = process.communicate()
-    children.discard(process)
-    if process.returncode:
-        lines = said.strip().splitlines()
-        return lines[-1] if lines else f"ended with {process.returncode}"
-    return json.loads((out / "results.json").read_text("utf-8"))
+    said = tempfile.TemporaryFile()
+    return _Started(subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=said), out, said)
+
+
+def _ended(started: _Started) -> dict[str, Any] | str:
+    """The results of a run; one line where it ended without."""
+    with started.said as said:
+        said.seek(0)
+        lines = said.read().decode("utf-8", "replace").strip().splitlines()
+    if started.process.returncode:
+        return lines[-1] if lines else f"ended with {started.process.returncode}"
+    return json.loads((started.out / "results.json").read_text("utf-8"))
 
 
 def _stated(row: Row) -> dict[str, Any]:
