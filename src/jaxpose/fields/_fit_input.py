@@ -41,6 +41,7 @@ def checked_poses(
 
 
 def check_span(field: PoseField, t: Float[np.ndarray, " n"]) -> None:
+    """ValueError for timestamps [s] outside of a field's span, and for a single one of a field that moves."""
     first, last = field.span
     if not np.isfinite([first, last]).all():
         return
@@ -102,6 +103,7 @@ def posenet_for(config: PoseNetConfig, t, T) -> PoseField:
 
 
 def evaluated(factors: tuple[Factor, ...], t: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 4 4"]:
+    """The poses that factors of a field, whatever arrays they hold, describe at times [s], in float64."""
     poses = np.tile(np.eye(4), (len(t), 1, 1))
     for factor in factors:
         numbers = {k: np.asarray(v, float) if k != "kind" else v for k, v in factor.items()}

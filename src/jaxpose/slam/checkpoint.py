@@ -56,11 +56,10 @@ def load(path: Path | str, recording: Recording, config: SlamConfig) -> SlamStat
         )
     if isinstance(grid, BlockConfig):
         state = state._replace(map=state.map._replace(params=unpacked(grid, *state.map.params)))
-    keyframes = np.flatnonzero(state.frames.keyframe)
-    corners = lambda i: detect(recording.read(int(i)), recording.camera)
     if config.uses_features:
-        last = state.frames.count - 1
-        state = state._replace(features=corners(last), keyframe_features=tuple(map(corners, keyframes)))
+        keyframes, last = np.flatnonzero(state.frames.keyframe).tolist(), state.frames.count - 1
+        seen = {i: detect(recording.read(i), recording.camera) for i in {*keyframes, last}}
+        state = state._replace(features=seen[last], keyframe_features=tuple(seen[i] for i in keyframes))
     return state._replace(
         config=config,
         grid=grid,

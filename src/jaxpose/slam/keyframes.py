@@ -45,6 +45,11 @@ def thumbnail(frame: Frame) -> Float[np.ndarray, "2 12 16"]:
     return channels / np.maximum(channels.std((1, 2), keepdims=True), 1e-3)
 
 
+def unlikeness(thumbnails: Float[np.ndarray, "k 2 12 16"], frame: Frame) -> Float[np.ndarray, " k"]:
+    """How little each thumbnail is like a frame's: the mean squared difference."""
+    return np.mean((thumbnails - thumbnail(frame)) ** 2, axis=(1, 2, 3))
+
+
 def overlap(
     points_world: np.ndarray, T_world_cam: np.ndarray, camera: Camera, *, margin: int = 20
 ) -> np.ndarray:

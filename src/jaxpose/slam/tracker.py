@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, PRNGKeyArray
 from jaxpose.datasets.types import Frame
 from jaxpose.geometry import rigid
 from jaxpose.slam.config import RecoveryConfig
-from jaxpose.slam.keyframes import thumbnail
+from jaxpose.slam.keyframes import unlikeness
 from jaxpose.slam.map.backend import map_backend, scene_params
 from jaxpose.slam.observation import Image, is_blank
 from jaxpose.slam.tracking.feature_pose import feature_nis, seen_pose, with_features
@@ -193,8 +193,7 @@ def _relocalise(
         angle = rigid.rotation_angle(away[:, :3, :3], np.eye(3))
         off = np.stack([np.linalg.norm(away[:, :3, 3], axis=1), angle], axis=1)
         near = np.all(off <= 3 * reach, axis=1)
-        unlike = np.mean((state.thumbnails - thumbnail(frame)) ** 2, axis=(1, 2, 3))
-        alike = [k for k in np.argsort(unlike) if near[k]]
+        alike = [k for k in np.argsort(unlikeness(state.thumbnails, frame)) if near[k]]
         chosen = [*([last] if near[-1] else []), *keyframes[alike]]
         centres += list(frames.T_world_body[chosen][: CENTRES - 1])
     spread = np.where(np.isfinite(reach), reach, state.config.recovery.around_keyframes)

@@ -4,7 +4,7 @@ import numpy as np
 
 from jaxpose.datasets.types import Frame
 from jaxpose.geometry import rigid
-from jaxpose.slam.keyframes import thumbnail
+from jaxpose.slam.keyframes import unlikeness
 from jaxpose.slam.tracking.features import FeaturePose, Features, locate_camera
 from jaxpose.slam.tracking.predict import MotionPrediction, constant_velocity
 from jaxpose.slam.tracking.register import Tracked
@@ -32,7 +32,7 @@ def seen_pose(
     T_world_cam, keyframes = frames.T_world_body @ state.T_body_cam, np.flatnonzero(frames.keyframe)
     if frames.doubted[i - 1]:
         before = []
-        order = np.argsort(np.mean((state.thumbnails - thumbnail(frame)) ** 2, axis=(1, 2, 3)))
+        order = np.argsort(unlikeness(state.thumbnails, frame))
     else:
         assert state.features is not None
         before = [(state.features, T_world_cam[i - 1])]
