@@ -107,9 +107,7 @@ class RecoveryConfig:
     """
 
     held: float = 0.08  # [m, rad] a prediction from the IMU that cannot be off by more is as good as no loss
-    held_by_features: float = (
-        0.05  # [m, rad] a pose known as well by features is not lost, whatever the map says
-    )
+    held_by_features: float = 0.05  # [m, rad] a pose known so well by features is not lost
     farthest: float = 0.5  # [m, rad] a search reaches no farther around a prediction; then anywhere
     around_keyframes: float = 0.25  # [m, rad] a search reaches around keyframes where nothing else is known
     recognised_valid: float = 0.7  # after a loss, of a camera that could be anywhere: share explained,

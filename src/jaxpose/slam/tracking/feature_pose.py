@@ -1,6 +1,7 @@
 """Poses by sparse features: how much they are worth, and what they say together with the prediction."""
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxpose.datasets.types import Frame
 from jaxpose.geometry import rigid
@@ -29,21 +30,21 @@ def seen_pose(
     is as many times larger as poses by features have been off so far.
     """
     frames, i = state.frames, state.frames.count - 1
-    T_world_cam, keyframes = frames.T_world_body @ state.T_body_cam, np.flatnonzero(frames.keyframe)
+    keyframes = np.flatnonzero(frames.keyframe)
+    T_world_keyframe = frames.T_world_body[keyframes] @ state.T_body_cam
     if frames.doubted[i - 1]:
         before = []
         order = np.argsort(unlikeness(state.thumbnails, frame))
     else:
         assert state.features is not None
-        before = [(state.features, T_world_cam[i - 1])]
-        T_predicted = frames.T_world_body[i - 1] @ predicted.T_ref_body[-1] @ state.T_body_cam
-        away = rigid.inverse(T_predicted) @ T_world_cam[keyframes]
+        before = [(state.features, frames.T_world_body[i - 1] @ state.T_body_cam)]
+        away = rigid.inverse(_predicted_camera(state, frames, predicted)) @ T_world_keyframe
         off = np.linalg.norm(away[:, :3, 3], axis=1) / [f.usual_depth for f in state.keyframe_features]
         off = off + rigid.rotation_angle(away[:, :3, :3], np.eye(3))
         order = np.argsort(off)[: _MATCHED - 1]
         if i - 1 in keyframes[order]:
             before = []  # it is among them
-    chosen = [(state.keyframe_features[k], T_world_cam[keyframes[k]]) for k in order[:_MATCHED]]
+    chosen = [(state.keyframe_features[k], T_world_keyframe[k]) for k in order[:_MATCHED]]
     seen = locate_camera(features, chosen, state.camera)
     if before and (seen is None or seen.inliers < _ENOUGH):
         seen = locate_camera(features, [*before, *chosen], state.camera)
@@ -61,8 +62,7 @@ def feature_nis(
     T_ref_body = rigid.inverse(predicted.T_ref_body[-1]) @ np.asarray(tracked.T_ref_body, np.float64)
     pulled = rigid.log(rigid.inverse(state.T_body_cam) @ T_ref_body @ state.T_body_cam)
     image = np.linalg.inv(information + 1e-9 * np.trace(information) * np.eye(6))
-    T_world_predicted = frames.T_world_body[-2] @ predicted.T_ref_body[-1] @ state.T_body_cam
-    alone = T_world_predicted @ rigid.exp(pulled + image @ expected @ pulled)
+    alone = _predicted_camera(state, frames, predicted) @ rigid.exp(pulled + image @ expected @ pulled)
     away = rigid.log(rigid.inverse(seen.T_world_cam) @ alone)
     return float(away @ np.linalg.solve(image + seen.covariance / _feature_scale(frames), away))
 
@@ -89,8 +89,8 @@ def with_features(
         frames = frames.corrected(rigid.inverse(T_predicted) @ T_world_body)
         covariance, fused = _GO_TOGETHER * seen.covariance, T_world_body
     else:
-        T_predicted = frames.T_world_body[i - 1] @ predicted.T_ref_body[-1] @ T_body_cam
-        apart = rigid.log(rigid.inverse(seen.T_world_cam) @ T_predicted)
+        T_world_predicted = _predicted_camera(state, frames, predicted)
+        apart = rigid.log(rigid.inverse(seen.T_world_cam) @ T_world_predicted)
         both = seen.covariance + predicted.covariance
         expected = np.linalg.inv(predicted.covariance)
         if apart @ np.linalg.solve(both, apart) > _CHI2_999:
@@ -100,3 +100,10 @@ def with_features(
         covariance = np.linalg.inv(support + expected)
     T_ref_body = rigid.inverse(frames.T_world_body[i - 1]) @ fused
     return state._replace(frames=frames), constant_velocity(predicted, T_ref_body, covariance, support)
+
+
+def _predicted_camera(
+    state: SlamState, frames: Frames, predicted: MotionPrediction
+) -> Float[np.ndarray, "4 4"]:
+    """The predicted pose of the camera at the last of the frames."""
+    return frames.T_world_body[-2] @ predicted.T_ref_body[-1] @ state.T_body_cam

@@ -43,17 +43,12 @@ class Features(NamedTuple):
     depth: Float[np.ndarray, " n"]  # [m] along the optical axis; 0 where there is none
     scale: Float[np.ndarray, " n"]  # [px] of the level of the pyramid
     descriptor: UInt8[np.ndarray, "n 32"]
+    usual_depth: float = 1.0  # [m] median of those known; kept, as every later frame asks for it
 
     @property
     def points_cam(self) -> Float[np.ndarray, "n 3"]:
         """Where they are, in camera axes [m]; the camera's centre for those without depth."""
         return self.direction_cam * self.depth[:, None]
-
-    @property
-    def usual_depth(self) -> float:
-        """The median of the depths that are known [m]; 1 without any."""
-        known = self.depth[self.depth > 0]
-        return float(np.median(known)) if len(known) else 1.0
 
 
 class FeaturePose(NamedTuple):
@@ -75,7 +70,9 @@ def detect(frame: Frame, camera: Camera) -> Features:
     scale = _PYRAMID[0] ** np.array([k.octave for k in keypoints], np.float64)
     column, row = np.rint(pixel).astype(int).T
     depth = frame.depth[row, column].astype(np.float64)
-    return Features(unproject_numpy(camera, pixel), depth, scale, descriptor)
+    features = Features(unproject_numpy(camera, pixel), depth, scale, descriptor)
+    known = depth[depth > 0]
+    return features._replace(usual_depth=float(np.median(known))) if len(known) else features
 
 
 def locate_camera(

@@ -144,8 +144,8 @@ def _descend(objective, params, config: TrackConfig, iterations: int, patience: 
     running means too: pixels differ from one iteration to the next.
     """
     rates = _rates(params, {"translation": config.learning_rate, "rotation": config.rotation_rate})
-    decays = lambda rate: lambda i: rate * config.decay ** (i.astype(jnp.float32) / iterations)
-    tx = optax.chain(optax.scale_by_adam(), scale_by_rates(jax.tree.map(decays, rates)))
+    decay = lambda rate: optax.exponential_decay(rate, iterations, config.decay)
+    tx = optax.chain(optax.scale_by_adam(), scale_by_rates(jax.tree.map(decay, rates)))
     found = minimize(objective, params, tx, iterations, has_aux=True, smoothing=0.8, patience=patience)
     return (found.params, found.aux), found.steps
 
