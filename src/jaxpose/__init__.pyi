@@ -1,4 +1,5 @@
 from . import datasets as datasets
+from . import estimate as estimate
 from . import evaluation as evaluation
 from . import events as events
 from . import fields as fields

@@ -120,8 +120,12 @@ def start_along(
     """`control_points_along` for any span, in float64: at each knot the pose between its neighbours."""
     first, last = span
     knots = first + (np.arange(intervals + 3) - 1) * ((last - first) / intervals)
-    control = numpy_evaluator.evaluate({"kind": "stamped", "times": times, "poses": poses}, knots)
-    return np.concatenate([control[:, :3, 3], unbroken_quaternions(control) - [1, 0, 0, 0]], axis=-1)
+    return control_rows(numpy_evaluator.evaluate({"kind": "stamped", "times": times, "poses": poses}, knots))
+
+
+def control_rows(T: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 7"]:
+    """`control_points` in float64 numpy."""
+    return np.concatenate([T[:, :3, 3], unbroken_quaternions(T) - [1, 0, 0, 0]], axis=-1)
 
 
 def unbroken_quaternions(T: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 4"]:

@@ -1,0 +1,5 @@
+"""Trajectories with their covariance: splines through poses and inertial readings, and their sensors."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,6 @@
+from .posterior import NoiseLevels as NoiseLevels
+from .posterior import Posterior as Posterior
+from .posterior import Sensors as Sensors
+from .smoothing import QUANTITIES as QUANTITIES
+from .smoothing import Quantity as Quantity
+from .smoothing import smooth as smooth

@@ -1,0 +1,235 @@
+"""Batch smoothing: one spline through poses and inertial readings, with its sensors and its covariance."""
+
+from collections.abc import Sequence
+from typing import Literal, NamedTuple, get_args
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+from jaxpose._checks import check_increasing
+from jaxpose.errors import DataError
+from jaxpose.estimate import alignment, inertial, solver
+from jaxpose.estimate.noise_levels import calibrated, first_levels
+from jaxpose.estimate.posterior import Posterior, posterior_of
+from jaxpose.estimate.system import Prior, Problem, State
+from jaxpose.fields._bspline import start_along
+from jaxpose.fields._fit_input import checked_poses
+from jaxpose.geometry import rigid
+from jaxpose.imu import GRAVITY_WORLD, Imu, ImuNoise
+from jaxpose.imu.types import check_readings
+
+Quantity = Literal["biases", "gravity", "offset", "extrinsics", "scale"]
+QUANTITIES = get_args(Quantity)
+
+_KNOTS_HZ = 20.0  # beside an IMU: hands and drones move up to 10 Hz
+_MARGIN_S = 0.2  # of the spline beyond the poses, for offsets that are yet to be found
+_REACH_S = 0.5  # of the offsets that are tried
+# What is known before, one sigma each: what no sensor that works is beyond
+_GYRO_BIAS, _ACCELEROMETER_BIAS = 0.3, 1.0  # rad/s, m/s^2
+_OFFSET_S, _LEVER_M, _TURN, _LOG_SCALE = 1.0, 1.0, 3.0, 10.0
+_WALK = ImuNoise(0.0, 0.0, 2e-5, 3e-3)  # of biases, where no data sheet says more: EuRoC's sensor
+
+
+def smooth(
+    times: ArrayLike,
+    T_world_cam: ArrayLike,
+    sigmas: ArrayLike,
+    imu: Imu | None = None,
+    *,
+    estimate: Sequence[str] = ("biases", "gravity"),
+    noise: ImuNoise | None = None,
+    fit_noise: bool = True,
+    T_body_cam: Float[np.ndarray, "4 4"] | None = None,
+    gravity_world: Float[np.ndarray, "3"] | None = None,
+    offset_s: float = 0.0,
+    knots_hz: float | None = None,
+) -> Posterior:
+    """The most likely trajectory through camera poses and inertial readings, and how sure it is.
+
+    Args:
+        times: timestamps of the poses (n,) [s], increasing.
+        T_world_cam: camera poses (n, 4, 4), in metres, or in any unit if the scale is estimated.
+        sigmas: one sigma of each pose, (6,) or (n, 6): position [their unit] and rotation [rad], along and
+            about the camera's own axes; or covariances (n, 6, 6).
+        imu: readings; None: poses alone, which are then as restless as they look, and none of `estimate`.
+        estimate: any of "biases", "gravity" (its direction), "offset" (t_imu = t_cam + offset), "extrinsics"
+            (T_body_cam), "scale" (metres per unit).
+        noise: data sheet of the IMU. Its densities are taken for optimistic, its walks are the biases'.
+        fit_noise: estimate noise levels too, of the readings in bands from slow to fast, and one factor for
+            all positions and one for all rotations. False: `noise` and `sigmas` are taken as they are.
+        T_body_cam: mounting (4, 4), or where its estimate starts; None: the IMU is where the camera is, or,
+            if "extrinsics" is estimated, unknown.
+        gravity_world: [m/s^2], or where its estimate starts; None: unknown if "gravity" is estimated.
+        offset_s: time offset, or where its estimate starts.
+        knots_hz: knots a second; None: 20 beside an IMU (fewer beside a slow one), else one a pose.
+
+    Returns:
+        The posterior.
+
+    Raises:
+        ValueError: shapes, sigmas or names that cannot be.
+        DataError: readings that do not overlap with the poses, or say nothing of what is asked.
+
+    >>> t, T = np.linspace(0.0, 2.0, 21), np.tile(np.eye(4), (21, 1, 1))
+    >>> smooth(t, T, [0.01] * 3 + [0.002] * 3).covariance([1.0, 1.05]).shape
+    (2, 6, 6)
+    """
+    measured = _measured(times, T_world_cam, sigmas, imu, estimate, noise, offset_s)
+    guess = _guess(measured, T_body_cam, gravity_world, offset_s)
+    return _solved(measured, guess, fit_noise, knots_hz)
+
+
+class _Measured(NamedTuple):
+    """What was measured, checked, and what is asked."""
+
+    t: Float[np.ndarray, " n"]
+    T: Float[np.ndarray, "n 4 4"]
+    root_information: Float[np.ndarray, "n 6 6"]
+    imu: Imu | None
+    noise: ImuNoise | None
+    estimate: tuple[str, ...]
+
+
+class _Guess(NamedTuple):
+    """Where the sensors' estimate starts."""
+
+    T_body_cam: Float[np.ndarray, "4 4"]
+    gravity_world: Float[np.ndarray, "3"]
+    offset_s: float
+    scale: float
+
+
+def _measured(times, T_world_cam, sigmas, imu, estimate, noise, offset_s: float) -> _Measured:
+    t, T = checked_poses(times, T_world_cam)
+    if len(t) < 2:
+        raise ValueError("poses: expected at least two, got one")
+    unknown = sorted(set(estimate) - set(QUANTITIES))
+    if unknown:
+        raise ValueError(f"estimate: expected any of {', '.join(QUANTITIES)}, got {', '.join(unknown)}")
+    if not np.isfinite(offset_s):
+        raise ValueError(f"offset_s: expected a number of seconds, got {offset_s}")
+    if imu is not None:
+        imu = _checked_readings(imu, t, offset_s)
+    names = () if imu is None else tuple(name for name in QUANTITIES if name in estimate)
+    return _Measured(t, T, _root_information(sigmas, len(t)), imu, noise, names)
+
+
+def _guess(measured: _Measured, T_body_cam, gravity_world, offset_s: float) -> _Guess:
+    """Mounting, gravity, offset and scale to start from: those that are given, and by alignment the rest."""
+    t, T, imu, asked = measured.t, measured.T, measured.imu, measured.estimate
+    if T_body_cam is None and "extrinsics" not in asked:
+        T_body_cam = np.eye(4)
+    gravity = np.array(GRAVITY_WORLD if gravity_world is None else gravity_world, np.float64)
+    if imu is None:
+        return _Guess(np.eye(4) if T_body_cam is None else T_body_cam, gravity, 0.0, 1.0)
+    R = None if T_body_cam is None else np.asarray(T_body_cam, np.float64)[:3, :3]
+    if R is None or "offset" in asked:
+        reach = _REACH_S if "offset" in asked else 0.0
+        shift, R = alignment.rotation_alignment(t + offset_s, T[:, :3, :3], imu, reach, R)
+        offset_s += shift
+    scale, unknown_gravity = 1.0, gravity_world is None and "gravity" in asked
+    if "scale" in asked or unknown_gravity:
+        size, known = float(np.linalg.norm(gravity)), None if "scale" in asked else 1.0
+        scale, found = alignment.scale_and_gravity(t + offset_s, T, imu, R, size, scale=known)
+        gravity = found if unknown_gravity else gravity
+    T_body_cam = rigid.make(R, np.zeros(3)) if T_body_cam is None else np.asarray(T_body_cam, np.float64)
+    return _Guess(T_body_cam, gravity, offset_s, scale)
+
+
+def _solved(measured: _Measured, guess: _Guess, fit_noise: bool, knots_hz: float | None) -> Posterior:
+    t, imu = measured.t + guess.offset_s, measured.imu
+    first, last = t[0] - _MARGIN_S, t[-1] + _MARGIN_S
+    if knots_hz is None:
+        knots_hz = 1 / float(np.median(np.diff(t)))
+        if imu is not None:
+            knots_hz = min(_KNOTS_HZ, 1 / (4 * float(np.median(np.diff(imu.t)))))
+    intervals = 3 * max(int(np.ceil((last - first) * knots_hz / 3)), 1)
+    none = Imu(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))
+    readings = inertial.node_readings(none if imu is None else imu, (first, last), intervals)
+    metric = measured.T.copy()
+    metric[:, :3, 3] *= guess.scale
+    along_body = metric @ rigid.inverse(guess.T_body_cam)
+    control = _control_poses((first, last), intervals, t, along_body)
+    levels = first_levels(readings, measured.noise, imu, t, metric, fit_noise)
+    with jax.enable_x64(True):
+        f = lambda x: jnp.asarray(x, jnp.float64)
+        bias = np.zeros((intervals // 3 + 1, 6))
+        start = (control, bias, guess.gravity_world, guess.offset_s, guess.T_body_cam, np.log(guess.scale))
+        state = State(*map(f, start))
+        prior = jax.tree.map(jnp.asarray, _prior(measured.estimate, measured.noise))
+        problem = Problem(
+            interval_s=f((last - first) / intervals),
+            root=f(readings.root),
+            value=f(readings.value),
+            t=f(measured.t - first),
+            T=f(measured.T),
+            root_information=f(measured.root_information),
+            start=state,
+            prior=prior,
+        )
+        level, usual = jax.tree.map(f, levels)
+        at = solver.optimise(problem, state, level)
+        if fit_noise:
+            at, level = calibrated(problem, at, level, usual)
+        return posterior_of(problem, at, level, readings, clock_s=first, estimated=measured.estimate)
+
+
+def _control_poses(span, intervals: int, t, T) -> Float[np.ndarray, "k 4 4"]:
+    """Control poses along the body's poses."""
+    points = start_along(span, intervals, t, T)
+    quaternion = points[:, 3:] + [1, 0, 0, 0]
+    return rigid.make(Rotation.from_quat(quaternion, scalar_first=True).as_matrix(), points[:, :3])
+
+
+def _prior(estimate: Sequence[str], noise: ImuNoise | None) -> Prior:
+    """What is known before; what is not estimated is known."""
+    walk = noise or _WALK
+    bias = np.repeat([_GYRO_BIAS, _ACCELEROMETER_BIAS], 3)
+    walks = np.repeat([walk.gyro_walk, walk.accelerometer_walk], 3)
+    if "biases" not in estimate:
+        bias, walks = np.zeros(6), np.zeros(6)
+    border = np.array([_TURN] * 2 + [_OFFSET_S] + [_LEVER_M] * 3 + [_TURN] * 3 + [_LOG_SCALE])
+    names = ["gravity"] * 2 + ["offset"] + ["extrinsics"] * 6 + ["scale"]
+    free = np.array([name in estimate for name in names])
+    return Prior(np.maximum(bias, 1e-9), np.maximum(walks, 1e-9), border, free)
+
+
+def _root_information(sigmas: ArrayLike, count: int) -> Float[np.ndarray, "n 6 6"]:
+    """Upper roots S of the information, S^T S, of each pose."""
+    x = np.asarray(sigmas, np.float64)
+    if x.shape in ((6,), (count, 6)):
+        if not (np.isfinite(x).all() and (x > 0).all()):
+            raise ValueError(f"sigmas: expected numbers above 0, got {x[~(x > 0) | np.isinf(x)][0]:g}")
+        return (1 / np.broadcast_to(x, (count, 6)))[:, :, None] * np.eye(6)
+    if x.shape != (count, 6, 6):
+        raise ValueError(f"sigmas: expected shape (6,), ({count}, 6) or ({count}, 6, 6), got {x.shape}")
+    try:
+        roots = np.linalg.cholesky(np.linalg.inv(x))
+    except np.linalg.LinAlgError:
+        raise ValueError("sigmas: expected covariances that are positive definite") from None
+    if not np.isfinite(roots).all():
+        raise ValueError("sigmas: expected finite covariances")
+    return np.swapaxes(roots, 1, 2)
+
+
+def _checked_readings(imu: Imu, t: Float[np.ndarray, " n"], offset_s: float) -> Imu:
+    """The readings in float64; an error for what cannot be used."""
+    check_readings(imu)
+    columns = {name: np.asarray(x, np.float64) for name, x in imu._asdict().items()}
+    for name, x in columns.items():
+        if not np.isfinite(x).all():
+            row = int(np.flatnonzero(~np.isfinite(x.reshape(len(x), -1)).all(1))[0])
+            raise DataError(f"IMU: expected finite numbers, got {name}[{row}] = {x[row]}")
+    times = columns["t"]
+    check_increasing(**{"imu.t": times})
+    first, last = t[0] + offset_s, t[-1] + offset_s
+    if len(times) < 2 or times[-1] <= first or times[0] >= last:
+        found = f"between {times[0]:.3f} and {times[-1]:.3f} s" if len(times) else "nowhere"
+        raise DataError(
+            f"IMU: expected readings between {first:.3f} and {last:.3f} s (the poses), got them {found}"
+        )
+    return Imu(**columns)

@@ -1,0 +1,321 @@
+"""The least-squares problem of a spline, its sensors and what they measured: residuals and their derivatives.
+
+Unknowns: the control poses (moved on their right), the biases of gyroscope and accelerometer at every third
+knot (linear between), and, where they are free, the direction of gravity, the time offset t_imu = t_pose +
+offset, the mounting T_body_cam and the scale of the poses. The spline is the body's, in metres, on the clock
+of the IMU. Three control poses and the bias of their knot are one block.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxpose.estimate.blocks import Blocks
+from jaxpose.estimate.inertial import NODES, PLACES, lagrange
+from jaxpose.estimate.kinematics import Kinematics, Segment, basis, kinematics, segments
+from jaxpose.geometry import se3
+from jaxpose.imu.types import AnyArray
+
+BLOCK = 24  # unknowns: three control poses, and the biases at the first one's knot
+BORDER = 10  # gravity's direction 2, time offset 1, mounting 6, logarithm of the scale 1
+GRAVITY, OFFSET, MOUNTING, SCALE = slice(0, 2), slice(2, 3), slice(3, 9), slice(9, 10)
+_PAIR = 2 * BLOCK  # what an interval's residuals depend on beside the border
+HUBER = 16.81  # squared distance of a pose from which it counts by its size: 99% of chi^2 with 6 degrees
+
+
+class State(NamedTuple):
+    """What is estimated."""
+
+    control: Float[Array, "k 4 4"]  # T_world_body
+    bias: Float[Array, "b 6"]  # gyroscope [rad/s], accelerometer [m/s^2], at every third knot
+    gravity_world: Float[Array, "3"]  # [m/s^2], of known size
+    offset_s: Float[Array, ""]  # t_imu - t_pose
+    T_body_cam: Float[Array, "4 4"]
+    log_scale: Float[Array, ""]  # of metres per unit of the poses' positions
+
+
+class Noise(NamedTuple):
+    """One sigma of everything that is compared."""
+
+    gyro: Float[AnyArray, " m"]  # [rad/s] of a reading, in each band from slow to fast
+    accelerometer: Float[AnyArray, " m"]  # [m/s^2] of a reading
+    position: Float[AnyArray, ""]  # what the stated sigmas of poses are multiplied by
+    rotation: Float[AnyArray, ""]
+    acceleration: Float[AnyArray, ""]  # [m/s^2/sqrt(Hz)] of motion where no reading says anything
+    angular_acceleration: Float[AnyArray, ""]  # [rad/s^2/sqrt(Hz)]
+
+
+class Prior(NamedTuple):
+    """What is known before: one sigma each; the border's about where the state starts."""
+
+    bias: Float[AnyArray, "6"]  # of the first biases, about 0
+    walk: Float[AnyArray, "6"]  # of the biases, per square root of a second
+    border: Float[AnyArray, "10"]
+    free: Bool[AnyArray, "10"]  # which of the border is estimated
+
+
+class Problem(NamedTuple):
+    """What was measured, on one clock [s] that starts with the spline."""
+
+    interval_s: Float[Array, ""]
+    root: Float[Array, "n m m"]  # `inertial.NodeReadings`
+    value: Float[Array, "n m 6"]
+    t: Float[Array, " p"]  # of poses
+    T: Float[Array, "p 4 4"]  # T_world_cam as measured, positions in units of their own
+    root_information: Float[Array, "p 6 6"]  # S with S^T S the inverse of the covariance
+    start: State  # what the border's prior is about
+    prior: Prior
+
+
+class Rows(NamedTuple):
+    """Whitened residuals with their derivatives by a pair of blocks and the border."""
+
+    residual: Float[Array, "*n"]
+    jacobian: Float[Array, "*n 58"]
+
+
+class Residuals(NamedTuple):
+    """All residuals, in groups that share a noise level."""
+
+    inertial: Rows  # (pairs, bands, 6)
+    poses: Rows  # (poses, 6)
+    pair: Int[Array, " p"]  # that each pose depends on
+    motion: Rows  # (pairs, 3, 6)
+    walk: Rows  # (pairs, 6)
+
+
+def residuals(problem: Problem, state: State, noise: Noise) -> Residuals:
+    """Everything that was measured beside what the state predicts, whitened, and its derivatives."""
+    segment = segments(state.control)
+    count = segment.start.shape[0]
+    index, places = _where(problem, state, problem.t + state.offset_s)
+    index = jnp.concatenate([jnp.repeat(jnp.arange(count, dtype=index.dtype), NODES), index])
+    places = jnp.concatenate([jnp.tile(jnp.asarray(PLACES, places.dtype), count), places])
+    at = along(problem, segment, index, places)  # at nodes and poses alike: compiled once
+    at_nodes = jax.tree.map(lambda x: x[: count * NODES].reshape(count, NODES, *x.shape[1:]), at)
+    at_poses = jax.tree.map(lambda x: x[count * NODES :], at)
+    pose_rows, pair = _poses(problem, state, noise, index[count * NODES :], at_poses)
+    return Residuals(
+        _inertial(problem, state, noise, at_nodes), pose_rows, pair,
+        _motion(problem, noise, at_nodes), _walk(problem, state),
+    )  # fmt: skip
+
+
+def _inertial(problem: Problem, state: State, noise: Noise, at: Kinematics) -> Rows:
+    """Gyroscope: body rate and bias. Accelerometer: R^T (a - g) and bias."""
+    intervals = at.T.shape[0]
+    R = at.T[..., :3, :3]
+    turned = lambda x: jnp.einsum("nmji,j->nmi", R, x)
+    v, omega = at.twist[..., :3], at.twist[..., 3:]
+    gravity = turned(state.gravity_world)
+    force = at.twist_rate[..., :3] + jnp.cross(omega, v) - gravity
+    first, second = _bias_shares(intervals, state.bias.dtype)
+    bias = state.bias.repeat(3, 0)
+    bias = first * bias[:intervals, None] + second * bias[3 : intervals + 3, None]
+    predicted = jnp.concatenate([omega, force], axis=-1) + bias
+    J_force = at.rate_jacobian[..., :3, :] + se3.hat(omega) @ at.twist_jacobian[..., :3, :]
+    J_force -= se3.hat(v) @ at.twist_jacobian[..., 3:, :] + se3.hat(gravity) @ at.pose_jacobian[..., 3:, :]
+    J = jnp.concatenate([at.twist_jacobian[..., 3:, :], J_force], axis=-2)
+    tilt = se3.hat(state.gravity_world) @ tangent(state.gravity_world)
+    J_gravity = jnp.einsum("nmji,jd->nmid", R, tilt * _free(problem)[None, GRAVITY])
+    J_gravity = jnp.concatenate([jnp.zeros_like(J_gravity), J_gravity], axis=-2)
+    one = jnp.eye(6, dtype=J.dtype)[None, None]
+    J_bias = jnp.broadcast_to(
+        jnp.concatenate([first[..., None] * one, second[..., None] * one], axis=-1), (*J.shape[:-1], 12)
+    )
+    none = jnp.zeros((*J.shape[:-1], BORDER - 2), J.dtype)
+    rows = _in_pairs(predicted, J, J_bias, jnp.concatenate([J_gravity, none], axis=-1))
+    sigma = jnp.repeat(jnp.stack([noise.gyro, noise.accelerometer], axis=1), 3, axis=1)
+    r = jnp.einsum("nkm,nmi->nki", problem.root, rows.residual) - problem.value
+    J = jnp.einsum("nkm,nmij->nkij", problem.root, rows.jacobian)
+    return Rows(r / sigma[None], J / sigma[None, ..., None])
+
+
+def _motion(problem: Problem, noise: Noise, at: Kinematics) -> Rows:
+    """Rate of the twist in the middle of intervals, which is likely small where no reading says anything."""
+    silent = jnp.repeat((jnp.abs(problem.root).max(axis=(1, 2)) == 0).astype(at.T.dtype), 3)
+    sigma = jnp.repeat(jnp.stack([noise.acceleration, noise.angular_acceleration]), 3)
+    weight = (silent * jnp.sqrt(problem.interval_s))[:, None, None] / sigma[None, None]
+    middle = jnp.asarray(lagrange(np.array([0.5]))[0], weight.dtype)
+    r = jnp.einsum("m,nmi->ni", middle, at.twist_rate)[:, None] * weight
+    J = jnp.einsum("m,nmij->nij", middle, at.rate_jacobian)[:, None] * weight[..., None]
+    rest = jnp.zeros((*J.shape[:-1], 12 + BORDER), J.dtype)
+    return _in_pairs(r, J, rest[..., :12], rest[..., 12:])
+
+
+def _walk(problem: Problem, state: State) -> Rows:
+    """From each bias to the next."""
+    sigma = jnp.asarray(problem.prior.walk) * jnp.sqrt(3 * problem.interval_s)
+    J = jnp.zeros((6, _PAIR + BORDER), state.bias.dtype)
+    one = jnp.diag(1 / sigma)
+    J = J.at[:, 18:24].set(-one).at[:, 42:48].set(one)
+    r = (state.bias[1:] - state.bias[:-1]) / sigma[None]
+    return Rows(r, jnp.broadcast_to(J, (*r.shape, _PAIR + BORDER)))
+
+
+def _poses(
+    problem: Problem, state: State, noise: Noise, index: Int[Array, " p"], at: Kinematics
+) -> tuple[Rows, Int[Array, " p"]]:
+    """Camera poses: position in the measured camera's axes [its units], and rotation."""
+    found, J = jax.vmap(_camera, (0, None))(at, state)
+    shrunk = jnp.exp(-state.log_scale)
+
+    def residual(increment, T, T_measured):
+        T = se3.compose(T, se3.exp(increment[:6]))
+        position = jnp.exp(-increment[6]) * shrunk * T[:3, 3] - T_measured[:3, 3]
+        turn = se3.so3_log(T_measured[:3, :3].T @ T[:3, :3])
+        return jnp.concatenate([T_measured[:3, :3].T @ position, turn])
+
+    none = jnp.zeros(7, state.control.dtype)
+    r = jax.vmap(residual, (None, 0, 0))(none, found, problem.T)
+    dr = jax.vmap(jax.jacfwd(residual), (None, 0, 0))(none, found, problem.T)
+    J = dr[..., :6] @ J
+    J = jnp.concatenate([J[..., :-1], J[..., -1:] + dr[..., 6:]], axis=-1)
+    J = jnp.concatenate([J[..., :24], J[..., 24:] * _free(problem)[None, None]], axis=-1)
+    scale = jnp.repeat(jnp.stack([noise.position, noise.rotation]), 3)
+    r = jnp.einsum("pij,pj->pi", problem.root_information, r / scale[None])
+    J = problem.root_information @ (J / scale[None, :, None])
+    far = jnp.maximum(jnp.sum(r * r, axis=-1), HUBER)
+    root_weight = (HUBER / far) ** 0.25
+    phase = index % 3
+    placed = _placed(phase[:, None, None], J[..., :24], jnp.zeros((*J.shape[:-1], 12), J.dtype), J[..., 24:])
+    return Rows(r * root_weight[:, None], placed * root_weight[:, None, None]), index // 3
+
+
+def _where(
+    problem: Problem, state: State, t: Float[Array, " p"]
+) -> tuple[Int[Array, " p"], Float[Array, " p"]]:
+    """The interval that each time on the spline's clock falls in, and the place in it."""
+    place = t / problem.interval_s
+    index = jnp.clip(jnp.floor(place), 0, state.control.shape[0] - 4)
+    return index.astype(jnp.int32), jnp.clip(place - index, 0, 1)
+
+
+def along(
+    problem: Problem, segment: Segment, index: Int[Array, " p"], place: Float[Array, " p"]
+) -> Kinematics:
+    """The motion at places of intervals."""
+    per_interval = problem.interval_s ** jnp.arange(3, dtype=place.dtype)[:, None]
+    weights = basis(place, 1.0) / per_interval[None]
+    return jax.vmap(kinematics)(jax.tree.map(lambda x: x[index], segment), weights)
+
+
+def _camera(at: Kinematics, state: State) -> tuple[Float[Array, "4 4"], Float[Array, "6 34"]]:
+    """The camera's pose, and its increment's derivatives by four control poses and the border."""
+    to_camera = se3.adjoint(se3.inverse(state.T_body_cam))
+    zero, one = jnp.zeros((6, 1), to_camera.dtype), jnp.eye(6, dtype=to_camera.dtype)
+    by_offset = (to_camera @ at.twist)[:, None]
+    parts = [to_camera @ at.pose_jacobian, zero, zero, by_offset, one, zero]
+    return se3.compose(at.T, state.T_body_cam), jnp.concatenate(parts, axis=1)
+
+
+def camera_rows(
+    problem: Problem, state: State, t: Float[Array, " p"]
+) -> tuple[Float[Array, "p 4 4"], Float[Array, "p 6 58"], Int[Array, " p"]]:
+    """Camera poses at times of the poses' clock, and their increments' derivatives by a pair of blocks."""
+    index, place = _where(problem, state, t + state.offset_s)
+    at = along(problem, segments(state.control), index, place)
+    T, J = jax.vmap(_camera, (0, None))(at, state)
+    none = jnp.zeros((*J.shape[:-1], 12), J.dtype)
+    placed = _placed((index % 3)[:, None, None], J[..., :24], none, J[..., 24:] * _free(problem)[None, None])
+    return T, placed, index // 3
+
+
+def normal_equations(problem: Problem, state: State, found: Residuals) -> tuple[Blocks, Float[Array, ""]]:
+    """What Gauss-Newton solves, and half the sum of squares."""
+    pairs = state.bias.shape[0] - 1
+    H = jnp.zeros((pairs, _PAIR + BORDER, _PAIR + BORDER), state.control.dtype)
+    side = jnp.zeros(H.shape[:2], H.dtype)
+    for rows in (found.inertial, found.motion, found.walk):
+        J, r = rows.jacobian.reshape(pairs, -1, H.shape[1]), rows.residual.reshape(pairs, -1)
+        H, side = H + jnp.swapaxes(J, 1, 2) @ J, side - jnp.einsum("nri,nr->ni", J, r)
+    J, r = found.poses.jacobian, found.poses.residual
+    H = H + jax.ops.segment_sum(jnp.swapaxes(J, 1, 2) @ J, found.pair, pairs)
+    side = side - jax.ops.segment_sum(jnp.einsum("pri,pr->pi", J, r), found.pair, pairs)
+
+    joined = lambda a, b: jnp.concatenate([a, 0 * a[:1]]) + jnp.concatenate([0 * b[:1], b])
+    diagonal = joined(H[:, :BLOCK, :BLOCK], H[:, BLOCK:_PAIR, BLOCK:_PAIR])
+    border = joined(H[:, :BLOCK, _PAIR:], H[:, BLOCK:_PAIR, _PAIR:])
+    row = joined(side[:, :BLOCK], side[:, BLOCK:_PAIR])
+    corner, corner_side = H[:, _PAIR:, _PAIR:].sum(0), side[:, _PAIR:].sum(0)
+    prior = problem.prior
+    information = 1 / prior.bias**2
+    diagonal = diagonal.at[0, 18:, 18:].add(jnp.diag(information))
+    row = row.at[0, 18:].add(-information * state.bias[0])
+    away = border_difference(state, problem.start)
+    corner_information = 1 / prior.border**2
+    corner += jnp.diag(jnp.where(prior.free, corner_information, 1))
+    corner_side -= jnp.where(prior.free, corner_information * away, 0)
+    blocks = Blocks(diagonal, H[:, BLOCK:_PAIR, :BLOCK], border, corner, row, corner_side)
+    cost = sum(jnp.sum(rows.residual**2) for rows in (found.inertial, found.motion, found.walk))
+    pose_square = jnp.sum(found.poses.residual**2, axis=-1)  # already times the weight
+    far = pose_square**2 / HUBER  # the unweighted square where it is beyond
+    cost += jnp.sum(jnp.where(far > HUBER, 2 * jnp.sqrt(HUBER * far) - HUBER, pose_square))
+    cost += jnp.sum(information * state.bias[0] ** 2) + jnp.sum(_free(problem) * corner_information * away**2)
+    return blocks, cost / 2
+
+
+def retract(state: State, row: Float[Array, "b 24"], corner: Float[Array, "10"]) -> State:
+    """The state that increments of the unknowns lead to."""
+    step = row[:, :18].reshape(-1, 6)
+    g = state.gravity_world
+    turn = se3.so3_exp(tangent(g) @ corner[GRAVITY])
+    return State(
+        se3.compose(state.control, se3.exp(step)),
+        state.bias + row[:, 18:],
+        turn @ g,
+        state.offset_s + corner[OFFSET][0],
+        se3.compose(state.T_body_cam, se3.exp(corner[MOUNTING])),
+        state.log_scale + corner[SCALE][0],
+    )
+
+
+def border_difference(state: State, start: State) -> Float[Array, "10"]:
+    """The border's increments from the start, which its prior is about."""
+    g = start.gravity_world
+    axis = jnp.cross(g, state.gravity_world) / jnp.sum(g * g)
+    mounting = se3.log(se3.compose(se3.inverse(start.T_body_cam), state.T_body_cam))
+    return jnp.concatenate([
+        tangent(g).T @ axis, (state.offset_s - start.offset_s)[None], mounting,
+        (state.log_scale - start.log_scale)[None],
+    ])  # fmt: skip
+
+
+def tangent(g: Float[Array, "3"]) -> Float[Array, "3 2"]:
+    """Two unit vectors across gravity, about which it may turn."""
+    along = jax.nn.one_hot(jnp.argmin(jnp.abs(g)), 3, dtype=g.dtype)
+    first = jnp.cross(g, along)
+    first = first / jnp.linalg.norm(first)
+    return jnp.stack([first, jnp.cross(g, first) / jnp.linalg.norm(g)], axis=1)
+
+
+def _bias_shares(intervals: int, dtype) -> tuple[Float[np.ndarray, "n m 1"], Float[np.ndarray, "n m 1"]]:
+    second = ((np.arange(intervals) % 3)[:, None] + PLACES)[..., None] / 3
+    return np.asarray(1 - second, dtype), np.asarray(second, dtype)
+
+
+def _free(problem: Problem) -> Float[Array, "10"]:
+    return jnp.asarray(problem.prior.free, problem.interval_s.dtype)
+
+
+def _in_pairs(r, J_control, J_bias, J_border) -> Rows:
+    """Rows of every interval (n, m, 6) as rows of pairs of blocks (n / 3, 3 m, 6)."""
+    rows = r.shape[1]
+    three = lambda x: x.reshape(-1, 3 * rows, *x.shape[2:])
+    phase = jnp.repeat(jnp.arange(3), rows)[None, :, None, None]
+    return Rows(three(r), _placed(phase, *(three(x) for x in (J_control, J_bias, J_border))))
+
+
+def _placed(phase, control, bias, border):
+    """Derivatives by control poses `phase` to `phase` + 3, and by two biases, in the order of two blocks."""
+    four = jnp.split(control, 4, axis=-1)
+    zero = jnp.zeros_like(four[0])
+    early, late = jnp.split(bias, 2, axis=-1)
+    places = []
+    for k in range(6):
+        options = [four[k - p] if 0 <= k - p < 4 else zero for p in range(3)]
+        places.append(jnp.where(phase == 0, options[0], jnp.where(phase == 1, options[1], options[2])))
+    return jnp.concatenate([*places[:3], early, *places[3:], late, border], axis=-1)
