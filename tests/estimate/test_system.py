@@ -56,8 +56,8 @@ def test_every_derivative_is_that_of_finite_differences(control):
         roots = np.triu(rng.normal(size=(3, 6, 6))) + 3 * np.eye(6)
         measured = hand_held.body(poses)[0] @ T_body_cam @ rigid.exp(0.02 * rng.normal(size=(3, 6)))
         problem = Problem(
-            jnp.asarray(0.2), jnp.asarray(reduced.root), jnp.asarray(reduced.value), jnp.asarray(poses),
-            jnp.asarray(measured), jnp.asarray(roots), state, prior,
+            jnp.asarray(0.2), jnp.asarray(reduced.root), jnp.asarray(reduced.value), jnp.ones(2),
+            jnp.asarray(poses), jnp.asarray(measured), jnp.asarray(roots), state, prior,
         )  # fmt: skip
         at = jax.jit(residuals)
         found = at(problem, state, noise)

@@ -95,13 +95,18 @@ def test_numbers_are_those_of_the_files(finished):
 
 
 def test_a_saved_field_gives_the_trajectory_at_any_time(finished):
-    folder, results = finished
+    """With an IMU the trajectory that is written is the field, and the file says how sure it is."""
+    folder, _ = finished
     field, params = fields.load(folder / "field.npz")
     estimate = trajectories.read_tum(folder / "trajectory.txt")
     times = np.concatenate([estimate.t, np.linspace(0, estimate.t[-1], 50)]).astype(np.float32)
     poses = np.asarray(jax.jit(jax.vmap(field.pose, (None, 0)))(params, jnp.asarray(times)))
     distance = np.linalg.norm(poses[:FRAMES, :3, 3] - estimate.T[:, :3, 3], axis=1)
-    assert np.sqrt(np.mean(distance**2)) == pytest.approx(results["field_rmse_m"], abs=1e-5)
+    assert distance.max() < 1e-5
+    sigma = np.sqrt(
+        np.diagonal(numpy_evaluator.load_covariance(folder / "field.npz")(times), axis1=1, axis2=2)
+    )
+    assert sigma.shape == (len(times), 6) and (sigma > 1e-6).all() and (sigma < 0.1).all()
     np.testing.assert_allclose(numpy_evaluator.load(folder / "field.npz")(times), poses, atol=1e-6)
 
 
@@ -115,6 +120,8 @@ def test_report_states_numbers_with_their_protocol(finished):
     assert f"{100 * finished.results['ate_rmse_m']:.2f} cm  SE(3) alignment, 8 of 8 frames" in text
     assert "SMOKE" in text and str(finished.folder) in text and "trajectory.png" in text
     assert f"0 of {FRAMES} frames" in text
+    bias = finished.results["calibration"]["gyro_bias"]
+    assert f"IMU biases        {bias[0]:.4f}" in text
 
 
 @pytest.mark.slow

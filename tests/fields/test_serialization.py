@@ -136,7 +136,7 @@ def test_the_evaluator_is_one_short_file_without_jax(tmp_path):
     params = jnp.zeros((7, 7)).at[:, 0].set(jnp.arange(7.0))
     serialization.save(tmp_path / "field.npz", fields.bspline(SPAN, 4), params)
     source = Path(numpy_evaluator.__file__).read_text()
-    assert len(source.splitlines()) < 125
+    assert len(source.splitlines()) < 160
     (tmp_path / "copied.py").write_text(source)
     code = (
         "import sys, copied; print(copied.load('field.npz')([0.5, 4.0])[:, 0, 3].round(6).tolist(), "
@@ -177,3 +177,18 @@ def test_other_files_are_refused(tmp_path):
     (tmp_path / "text.npz").write_text("no archive")
     with pytest.raises(DataError, match="text.npz: expected a trajectory, got"):
         serialization.load(tmp_path / "text.npz")
+
+
+def test_covariances_are_kept_and_interpolated(tmp_path):
+    """At the times that were written, between them, and a line for what is not known."""
+    times, P = np.array([0.5, 1.0, 2.0]), np.stack([np.diag([k + 1.0] * 6) for k in range(3)])
+    field, params = fields.bspline(SPAN, 4), jnp.zeros((7, 7))
+    serialization.save(tmp_path / "field.npz", field, params, covariance=(times, P))
+    found = numpy_evaluator.load_covariance(tmp_path / "field.npz")
+    np.testing.assert_allclose(found([0.5, 1.5, 2.0]), [P[0], np.diag([2.5] * 6), P[2]])
+    assert serialization.load(tmp_path / "field.npz")[0] == field
+    with pytest.raises(ValueError, match="expected times between 0.5 and 2 s"):
+        found(2.5)
+    serialization.save(tmp_path / "other.npz", field, params)
+    with pytest.raises(ValueError, match="got a trajectory without"):
+        numpy_evaluator.load_covariance(tmp_path / "other.npz")

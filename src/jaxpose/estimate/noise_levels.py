@@ -9,6 +9,7 @@ from jaxpose.estimate import inertial, solver
 from jaxpose.estimate.system import Noise, Problem
 from jaxpose.geometry import rigid
 from jaxpose.imu import Imu, ImuNoise
+from jaxpose.imu.types import AnyArray
 
 _ROUNDS = 10  # at most
 _CALM = 0.05  # share by which a level changes when it is found
@@ -61,17 +62,28 @@ def calibrated(
     """The best state, and the levels of noise at which residuals are as large as they are expected to be.
 
     A group's sum of squares is expected to be its number less what the unknowns explain of it, which is the
-    estimate of variance components by restricted maximum likelihood (Patterson and Thompson 1971).
+    estimate of variance components by restricted maximum likelihood (Patterson and Thompson 1971). A factor
+    of poses is known where a sensor measures the same: one sensor of the two tells it for positions and
+    rotations alike, none tells nothing.
     """
     for _ in range(_ROUNDS):
         fit = solver.spread(at)[1]
         new = jax.tree.map(_level, level, usual, fit.squares, fit.degrees)
+        new = new._replace(**_of_poses(problem, level, new))
         calm = all(jnp.all(jnp.abs(a / b - 1) < _CALM) for a, b in zip(new, level, strict=True))
         level = new
         at = solver.optimise(problem, at.state, level, steps=1)
         if calm:
             break
     return solver.optimise(problem, at.state, level), level
+
+
+def _of_poses(problem: Problem, level: Noise, new: Noise) -> dict[str, Float[AnyArray, ""]]:
+    gyro, accelerometer = (float(x) > 0 for x in problem.used)
+    if gyro and accelerometer:
+        return {"position": new.position, "rotation": new.rotation}
+    one = new.rotation if gyro else new.position if accelerometer else level.position
+    return {"position": one, "rotation": one}
 
 
 def _level(level, usual, squares, degrees) -> Float[Array, "*m"]:

@@ -24,9 +24,10 @@ from jaxpose.imu.types import check_readings
 
 Quantity = Literal["biases", "gravity", "offset", "extrinsics", "scale"]
 QUANTITIES = get_args(Quantity)
+SENSORS = ("gyroscope", "accelerometer")
 
 _KNOTS_HZ = 20.0  # beside an IMU: hands and drones move up to 10 Hz
-_MARGIN_S = 0.2  # of the spline beyond the poses, for offsets that are yet to be found
+_MARGIN_S = 0.2  # of the spline beyond the poses, where their time offset is estimated
 _REACH_S = 0.5  # of the offsets that are tried
 # What is known before, one sigma each: what no sensor that works is beyond
 _GYRO_BIAS, _ACCELEROMETER_BIAS = 0.3, 1.0  # rad/s, m/s^2
@@ -40,6 +41,7 @@ def smooth(
     sigmas: ArrayLike,
     imu: Imu | None = None,
     *,
+    use: Sequence[str] = ("gyroscope", "accelerometer"),
     estimate: Sequence[str] = ("biases", "gravity"),
     noise: ImuNoise | None = None,
     fit_noise: bool = True,
@@ -56,11 +58,12 @@ def smooth(
         sigmas: one sigma of each pose, (6,) or (n, 6): position [their unit] and rotation [rad], along and
             about the camera's own axes; or covariances (n, 6, 6).
         imu: readings; None: poses alone, which are then as restless as they look, and none of `estimate`.
+        use: which of the sensors' readings count.
         estimate: any of "biases", "gravity" (its direction), "offset" (t_imu = t_cam + offset), "extrinsics"
             (T_body_cam), "scale" (metres per unit).
         noise: data sheet of the IMU. Its densities are taken for optimistic, its walks are the biases'.
-        fit_noise: estimate noise levels too, of the readings in bands from slow to fast, and one factor for
-            all positions and one for all rotations. False: `noise` and `sigmas` are taken as they are.
+        fit_noise: estimate noise levels too, of the readings in bands from slow to fast, and a factor for all
+            positions and one for all rotations. False: `noise` and `sigmas` are taken as they are.
         T_body_cam: mounting (4, 4), or where its estimate starts; None: the IMU is where the camera is, or,
             if "extrinsics" is estimated, unknown.
         gravity_world: [m/s^2], or where its estimate starts; None: unknown if "gravity" is estimated.
@@ -78,7 +81,7 @@ def smooth(
     >>> smooth(t, T, [0.01] * 3 + [0.002] * 3).covariance([1.0, 1.05]).shape
     (2, 6, 6)
     """
-    measured = _measured(times, T_world_cam, sigmas, imu, estimate, noise, offset_s)
+    measured = _measured(times, T_world_cam, sigmas, imu, use, estimate, noise, offset_s)
     guess = _guess(measured, T_body_cam, gravity_world, offset_s)
     return _solved(measured, guess, fit_noise, knots_hz)
 
@@ -90,6 +93,7 @@ class _Measured(NamedTuple):
     T: Float[np.ndarray, "n 4 4"]
     root_information: Float[np.ndarray, "n 6 6"]
     imu: Imu | None
+    used: Float[np.ndarray, "2"]
     noise: ImuNoise | None
     estimate: tuple[str, ...]
 
@@ -103,19 +107,20 @@ class _Guess(NamedTuple):
     scale: float
 
 
-def _measured(times, T_world_cam, sigmas, imu, estimate, noise, offset_s: float) -> _Measured:
+def _measured(times, T_world_cam, sigmas, imu, use, estimate, noise, offset_s: float) -> _Measured:
     t, T = checked_poses(times, T_world_cam)
     if len(t) < 2:
         raise ValueError("poses: expected at least two, got one")
-    unknown = sorted(set(estimate) - set(QUANTITIES))
-    if unknown:
-        raise ValueError(f"estimate: expected any of {', '.join(QUANTITIES)}, got {', '.join(unknown)}")
+    for name, given, known in (("estimate", estimate, QUANTITIES), ("use", use, SENSORS)):
+        if unknown := sorted(set(given) - set(known)):
+            raise ValueError(f"{name}: expected any of {', '.join(known)}, got {', '.join(unknown)}")
     if not np.isfinite(offset_s):
         raise ValueError(f"offset_s: expected a number of seconds, got {offset_s}")
     if imu is not None:
         imu = _checked_readings(imu, t, offset_s)
     names = () if imu is None else tuple(name for name in QUANTITIES if name in estimate)
-    return _Measured(t, T, _root_information(sigmas, len(t)), imu, noise, names)
+    used = np.array([imu is not None and name in use for name in SENSORS], np.float64)
+    return _Measured(t, T, _root_information(sigmas, len(t)), imu, used, noise, names)
 
 
 def _guess(measured: _Measured, T_body_cam, gravity_world, offset_s: float) -> _Guess:
@@ -142,7 +147,8 @@ def _guess(measured: _Measured, T_body_cam, gravity_world, offset_s: float) -> _
 
 def _solved(measured: _Measured, guess: _Guess, fit_noise: bool, knots_hz: float | None) -> Posterior:
     t, imu = measured.t + guess.offset_s, measured.imu
-    first, last = t[0] - _MARGIN_S, t[-1] + _MARGIN_S
+    margin = _MARGIN_S if "offset" in measured.estimate else 0.0
+    first, last = t[0] - margin, t[-1] + margin
     if knots_hz is None:
         knots_hz = 1 / float(np.median(np.diff(t)))
         if imu is not None:
@@ -165,6 +171,7 @@ def _solved(measured: _Measured, guess: _Guess, fit_noise: bool, knots_hz: float
             interval_s=f((last - first) / intervals),
             root=f(readings.root),
             value=f(readings.value),
+            used=f(measured.used),
             t=f(measured.t - first),
             T=f(measured.T),
             root_information=f(measured.root_information),

@@ -23,6 +23,7 @@ BLOCK = 24  # unknowns: three control poses, and the biases at the first one's k
 BORDER = 10  # gravity's direction 2, time offset 1, mounting 6, logarithm of the scale 1
 GRAVITY, OFFSET, MOUNTING, SCALE = slice(0, 2), slice(2, 3), slice(3, 9), slice(9, 10)
 _PAIR = 2 * BLOCK  # what an interval's residuals depend on beside the border
+_RIDGE = 1e-3  # share of a motion's likely smallness that holds beside readings, so that all is determined
 HUBER = 16.81  # squared distance of a pose from which it counts by its size: 99% of chi^2 with 6 degrees
 
 
@@ -63,6 +64,7 @@ class Problem(NamedTuple):
     interval_s: Float[Array, ""]
     root: Float[Array, "n m m"]  # `inertial.NodeReadings`
     value: Float[Array, "n m 6"]
+    used: Float[Array, "2"]  # 1 or 0: gyroscope, accelerometer
     t: Float[Array, " p"]  # of poses
     T: Float[Array, "p 4 4"]  # T_world_cam as measured, positions in units of their own
     root_information: Float[Array, "p 6 6"]  # S with S^T S the inverse of the covariance
@@ -128,17 +130,20 @@ def _inertial(problem: Problem, state: State, noise: Noise, at: Kinematics) -> R
     )
     none = jnp.zeros((*J.shape[:-1], BORDER - 2), J.dtype)
     rows = _in_pairs(predicted, J, J_bias, jnp.concatenate([J_gravity, none], axis=-1))
-    sigma = jnp.repeat(jnp.stack([noise.gyro, noise.accelerometer], axis=1), 3, axis=1)
+    sigma = jnp.stack([noise.gyro, noise.accelerometer], axis=1)
+    weight = jnp.repeat(problem.used[None] / sigma, 3, axis=1)[None]
     r = jnp.einsum("nkm,nmi->nki", problem.root, rows.residual) - problem.value
     J = jnp.einsum("nkm,nmij->nkij", problem.root, rows.jacobian)
-    return Rows(r / sigma[None], J / sigma[None, ..., None])
+    return Rows(r * weight, J * weight[..., None])
 
 
 def _motion(problem: Problem, noise: Noise, at: Kinematics) -> Rows:
     """Rate of the twist in the middle of intervals, which is likely small where no reading says anything."""
-    silent = jnp.repeat((jnp.abs(problem.root).max(axis=(1, 2)) == 0).astype(at.T.dtype), 3)
-    sigma = jnp.repeat(jnp.stack([noise.acceleration, noise.angular_acceleration]), 3)
-    weight = (silent * jnp.sqrt(problem.interval_s))[:, None, None] / sigma[None, None]
+    by_interval = jnp.abs(problem.root).max(axis=1).reshape(-1, NODES).max(axis=1)
+    known = jnp.stack([by_interval * used for used in problem.used[::-1]], axis=1)
+    sigma = jnp.stack([noise.acceleration, noise.angular_acceleration])
+    weight = jnp.where(known > 0, _RIDGE, 1) * jnp.sqrt(problem.interval_s) / sigma[None]
+    weight = jnp.repeat(weight, 3, axis=1)[:, None]
     middle = jnp.asarray(lagrange(np.array([0.5]))[0], weight.dtype)
     r = jnp.einsum("m,nmi->ni", middle, at.twist_rate)[:, None] * weight
     J = jnp.einsum("m,nmij->nij", middle, at.rate_jacobian)[:, None] * weight[..., None]

@@ -33,6 +33,35 @@ def load(path):
     return pose
 
 
+def load_covariance(path):
+    """How sure a trajectory is.
+
+    Args:
+        path: a `field.npz` of a run that knows.
+
+    Returns:
+        A function of times (n,) [s] to covariances (n, 6, 6) of the increment [translation, rotation] (m,
+        rad) on the right of the pose. It raises a ValueError for times beyond those that are known.
+
+    Raises:
+        ValueError: a file without covariances.
+    """
+    with np.load(path, allow_pickle=False) as file:
+        if "covariance" not in file:
+            raise ValueError(f"{path}: expected covariances, got a trajectory without")
+        times, known = file["covariance_times"], file["covariance"]
+
+    def covariance(t):
+        t = np.atleast_1d(np.asarray(t, float))
+        if not ((t >= times[0]) & (t <= times[-1])).all():
+            raise ValueError(f"t: expected times between {times[0]:.6g} and {times[-1]:.6g} s, got {t}")
+        i = np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(times) - 2)
+        share = ((t - times[i]) / (times[i + 1] - times[i]))[:, None, None]
+        return (1 - share) * known[i] + share * known[i + 1]
+
+    return covariance
+
+
 def evaluate(factor, t):
     """One factor of a trajectory.
 

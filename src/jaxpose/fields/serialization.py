@@ -18,13 +18,21 @@ The pose at time t is a product of factors, factor 0 . factor 1 . ..., camera-to
                 near (`fields.per_frame_poses`)
     stamped     times (n,) [s]; poses (n, 4, 4): constant twist between timestamps, at rest before and
                 after (`fields.piecewise_geodesic`; with one timestamp `fields.constant`)
+
+Where it is known how sure the pose is, the file holds too
+
+    covariance_times   (m,) increasing [s]
+    covariance         (m, 6, 6) at those times, to be interpolated: of the increment [translation, rotation]
+                       (m, rad) on the right of the pose, along and about the camera's own axes
 """
 
 import zipfile
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
+from jaxpose._checks import check_shapes
 from jaxpose.errors import DataError
 from jaxpose.fields import _bspline, _per_frame, _posenet, composition
 from jaxpose.fields.types import Factor, Params, PoseField
@@ -40,7 +48,14 @@ _FROM_FACTOR = {
 }
 
 
-def save(path: Path | str, field: PoseField, params: Params, *, alignment: Similarity | None = None) -> None:
+def save(
+    path: Path | str,
+    field: PoseField,
+    params: Params,
+    *,
+    alignment: Similarity | None = None,
+    covariance: tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m 6 6"]] | None = None,
+) -> None:
     """Write a field with its parameters to a file, as this module describes it.
 
     Args:
@@ -49,6 +64,7 @@ def save(path: Path | str, field: PoseField, params: Params, *, alignment: Simil
             cannot be saved.
         params: its parameters.
         alignment: what the poses are moved by, as `trajectory_error.align` does: scaled, turned and moved.
+        covariance: times [s] and the covariances of the pose there, where they are known.
 
     Raises:
         ValueError: the field, or a part of it, has no description.
@@ -61,6 +77,11 @@ def save(path: Path | str, field: PoseField, params: Params, *, alignment: Simil
         T[:3, :3], T[:3, 3] = alignment.rotation, alignment.translation
         moved = {"kind": "stamped", "times": np.zeros(1), "poses": T[None]}
         factors = (moved, *(_scaled(factor, alignment.scale) for factor in factors))
+    known = {}
+    if covariance is not None:
+        check_shapes(times=(covariance[0], "m"), covariance=(covariance[1], "m 6 6"))
+        lengths = np.repeat([1.0 if alignment is None else alignment.scale, 1.0], 3)
+        known = {"covariance_times": covariance[0], "covariance": covariance[1] * np.outer(lengths, lengths)}
     entries = {f"{k}.{name}": value for k, factor in enumerate(factors) for name, value in factor.items()}
     with atomic(path) as temporary:
         np.savez(
@@ -70,6 +91,7 @@ def save(path: Path | str, field: PoseField, params: Params, *, alignment: Simil
             span=np.asarray(field.span, np.float64),
             count=len(factors),
             **entries,
+            **known,
         )
 
 

@@ -142,6 +142,8 @@ class SlamConfig:
     frame: FrameName = "anchored"
     # Sparse features as a second opinion on the motion (`gauss_newton` only): ORB by OpenCV, or none.
     features: Literal["orb", "none"] = "orb"
+    # What the final pass over a run with an IMU finds beside biases and gravity: time offset, T_body_cam.
+    estimate: tuple[Literal["offset", "extrinsics"], ...] = ()
     seed: int = 0  # of the network's start, the pixels drawn, the noise of a simulated IMU
     field: PoseNetConfig = PoseNetConfig(layers=4, width=128, activation="softplus")
     track: TrackConfig = TrackConfig()

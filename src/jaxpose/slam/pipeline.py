@@ -15,12 +15,14 @@ from jaxtyping import Float, Int
 
 from jaxpose.datasets.types import Frame, Recording, check_frame
 from jaxpose.errors import DataError
-from jaxpose.fields import Params, PoseField, bspline, fit
+from jaxpose.estimate import Posterior
+from jaxpose.fields import Params, PoseField
 from jaxpose.geometry import rigid
 from jaxpose.geometry.camera import Camera, angle_of_view
 from jaxpose.imu import GRAVITY_WORLD, Gravity, Imu
 from jaxpose.scenes import SceneField
 from jaxpose.scenes.voxel_blocks import BlockConfig, Blocks, blocks_of_grid, voxel_blocks
+from jaxpose.slam.batch import final_trajectory
 from jaxpose.slam.config import SlamConfig
 from jaxpose.slam.initial_pose import first_pose, upright_pose
 from jaxpose.slam.keyframes import FrameReader, keyframe_images, thumbnail
@@ -63,8 +65,9 @@ class SlamResult(NamedTuple):
     scene_params: tuple[Blocks, Texture]
     field: PoseField  # camera in the world, over seconds since the first frame
     field_params: Params
-    field_rmse_m: float
+    field_rmse_m: float  # of the field at the frames' times to the tracked poses
     field_rmse_deg: float
+    posterior: Posterior | None  # of a run with an IMU: covariance at any time, and the sensors
 
     @property
     def keyframes(self) -> Int[np.ndarray, " k"]:
@@ -175,7 +178,7 @@ def finish(state: SlamState) -> SlamResult:
     Raises:
         DataError: for fewer than two frames.
     """
-    return _finish(state, lambda i: _kept_image(state, i))
+    return _finish(state, lambda i: _kept_image(state, i), None)
 
 
 def run(
@@ -213,7 +216,7 @@ def run(
         state = state._replace(frames=state.frames.put(i, seconds=time.perf_counter() - started))
         if on_frame is not None:
             on_frame(Progress(i, len(recording.t), state, _ground_truth_error(recording, state)))
-    return _finish(state, recording.read)
+    return _finish(state, recording.read, recording.imu)
 
 
 def begin(recording: Recording, config: SlamConfig = _DEFAULT) -> SlamState:
@@ -300,34 +303,23 @@ def _refit(camera: Camera, config: SlamConfig):
     return make_refit(*framed.parts, angle_of_view(camera)[0])
 
 
-def _finish(state: SlamState, read: FrameReader) -> SlamResult:
-    """One field fitted to all poses, and the map with its texture.
-
-    A B-spline with a knot a frame: a PoseNet over the same 12 s of the default room stayed 1.5 cm from the
-    poses, and where the camera had turned once around it took the other way.
-    """
+def _finish(state: SlamState, read: FrameReader, imu: Imu | None) -> SlamResult:
+    """One continuous trajectory, by all readings or else through all poses, and the map with its texture."""
     if state.frames.count < 2:
         raise DataError(f"SLAM: expected at least 2 frames, got {state.frames.count}")
     if state.config.frame == "intrinsic" and not is_due(state.frames.count - 1):
         state = _update_intrinsic_frame(state)
-    frames = state.frames
-    T_world_cam, t = frames.T_world_body @ state.T_body_cam, frames.t - frames.t[0]
-    intervals = max(round(t[-1] / float(np.median(np.diff(t)))), 1)
-    field = bspline((0.0, float(t[-1])), intervals)
-    fitted = fit(field, t, T_world_cam)
+    frames, found = state.frames, final_trajectory(state, imu)
+    tracked = frames.T_world_body @ state.T_body_cam
     config, blocks = _as_blocks(state)
-    keyframes = keyframe_images(read, np.flatnonzero(frames.keyframe), T_world_cam)
+    keyframes = keyframe_images(read, np.flatnonzero(frames.keyframe), tracked)
     texture = make_texture(config, blocks, keyframes, state.camera)
     return SlamResult(
-        T_world_cam,
-        frames,
+        frames=frames,
         scene=textured(voxel_blocks(config), config),
         map_config=config,
         scene_params=(blocks, jax.tree.map(jnp.asarray, texture)),
-        field=field,
-        field_params=fitted.params,
-        field_rmse_m=float(fitted.translation_rmse_m),
-        field_rmse_deg=float(fitted.rotation_rmse_deg),
+        **found._asdict(),
     )
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 from jaxpose.experiments.outcome import SMOKE, cost_text, markdown_table
 from jaxpose.experiments.progress import Update
+from jaxpose.experiments.slam.calibration import calibration_lines
 from jaxpose.slam import ImuMode, Progress
 
 _COLUMNS: tuple[str, ...] = ("IMU", "ATE [cm]", "RPE [cm]", "RPE [deg]", "frames lost", "s / frame")
@@ -82,6 +83,8 @@ def report(folder: Path, results: dict[str, Any]) -> str:
             "RMSE to the tracked poses",
         ),
     ]
+    if "calibration" in results:
+        lines += [_line(*line) for line in calibration_lines(results["calibration"])]
     if "degrees_of_freedom" in results:
         dof = results["degrees_of_freedom"]
         lines.append(_line(

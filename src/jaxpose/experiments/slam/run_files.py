@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from jaxpose.datasets.types import Recording
 from jaxpose.experiments.progress import OnUpdate, Update
+from jaxpose.experiments.slam.calibration import calibration_numbers
 from jaxpose.experiments.slam.evaluation import (
     Measured,
     accuracy,
@@ -30,6 +31,8 @@ from jaxpose.slam import SlamResult
 from jaxpose.slam.initial_pose import first_pose
 from jaxpose.slam.keyframes import keyframe_images
 from jaxpose.slam.map.mesh import mesh, point_cloud
+
+_COVARIANCE_HZ = 20.0  # of the covariances in field.npz
 
 
 def write_run(
@@ -65,7 +68,8 @@ def write_run(
     quality = map_quality(result, render)
     on_update(Update("drawing figures"))
     _draw(folder, f"{recording.name}, IMU {options.slam.imu}", recording, result, render, measured)
-    found = {**tracking_numbers(result), **measured.numbers(), "map": quality, "notes": notes}
+    calibration = {} if result.posterior is None else {"calibration": calibration_numbers(result.posterior)}
+    found = {**tracking_numbers(result), **measured.numbers(), **calibration, "map": quality, "notes": notes}
     return found, np.full(len(recording.t), np.nan) if errors is None else errors.translation_m
 
 
@@ -75,7 +79,18 @@ def _write_trajectory(folder: Path, recording: Recording, result: SlamResult) ->
     trajectories.write_tum(folder / "trajectory.txt", trajectories.Trajectory(t, result.T_world_cam))
     if ground_truth is not None:
         trajectories.write_tum(folder / "reference.txt", trajectories.Trajectory(t, ground_truth))
-    save(folder / "field.npz", result.field, result.field_params)
+    known = result.posterior
+    if known is None:
+        save(folder / "field.npz", result.field, result.field_params)
+        return
+    first, last = known.span
+    times = np.linspace(first, last, int(np.ceil((last - first) * _COVARIANCE_HZ)) + 1)
+    save(
+        folder / "field.npz",
+        result.field,
+        result.field_params,
+        covariance=(times, known.covariance(times)),
+    )
 
 
 def _write_surface(folder: Path, recording: Recording, result: SlamResult) -> tuple[str, ...]:
