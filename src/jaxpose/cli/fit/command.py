@@ -3,12 +3,15 @@
 TRAJECTORY is a file of timestamped poses (TUM, KITTI, EuRoC or TUM-VI csv, 4x4 lists: found by its content)
 or a run folder. Every tenth pose is held out. With --imu the fields' own derivatives, which have seen poses
 only, are compared with a gyroscope and an accelerometer.
+
+With --imu and --estimate poses and readings together give one trajectory, in metres and upright, with its
+covariance, and the sensors: how far apart their clocks are, how the camera is mounted, scale, biases.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 import tyro
@@ -16,13 +19,17 @@ import tyro
 from jaxpose.cli.fit.types import FEWEST, Fitted, Sensor
 from jaxpose.cli.source import read_source
 from jaxpose.errors import DataError
-from jaxpose.experiments.checks import check_apart, check_least, check_positive
+from jaxpose.experiments.checks import check_apart, check_least, check_positive, check_unused
 from jaxpose.experiments.command import Command, execute
 from jaxpose.experiments.outcome import markdown_table
 from jaxpose.experiments.progress import OnUpdate, Update, silent
 from jaxpose.files.trajectories import Trajectory
 from jaxpose.geometry.rigid import Similarity
 
+if TYPE_CHECKING:
+    from jaxpose.cli.fit.calibration import Calibration
+
+Quantity = Literal["biases", "gravity", "offset", "extrinsics", "scale"]
 _SLOW = 3.0  # times the best field's error
 
 
@@ -33,8 +40,18 @@ class Config:
     trajectory: Annotated[
         Path, tyro.conf.Positional, tyro.conf.arg(metavar="TRAJECTORY")
     ]  # file of timestamped poses, or a run folder
-    # Folder in the EuRoC layout whose mav0/imu0 was read by the same clock, in the same body, as the poses.
+    # Folder in the EuRoC layout whose mav0/imu0 was read by the same clock, in the same body, as the poses;
+    # with --estimate also a file of readings, EuRoC's csv or lines of `t wx wy wz ax ay az`.
     imu: Path | None = None
+    estimate: tuple[Quantity, ...] = ()  # what to find by --imu, beside the trajectory
+    extrinsics: Path | None = (
+        None  # of --estimate: T_body_cam, or where its estimate starts, as in `jaxpose slam`
+    )
+    position_sigma: float = (
+        0.02  # of --estimate: one sigma of positions, in their unit; a first guess will do
+    )
+    rotation_sigma_deg: float = 0.5  # of --estimate: one sigma of rotations; a first guess will do
+    kalibr: Path | None = None  # of --estimate: write Kalibr's camchain, T_cam_imu and timeshift_cam_imu
     recorded_hz: float | None = None  # [Hz] rate of the poses where the file has no timestamps
     posenet_octaves: tuple[int, ...] = (5, 8)  # PoseNets to fit, by the octaves of their time encoding
     posenet_layers: int = 8  # of PoseNets
@@ -43,7 +60,7 @@ class Config:
     steps: int = 1000  # of Adam, for each field
     seed: int = 0  # of the networks' start
     out: Path | None = (
-        None  # write the field that fits best: npz that `jaxpose/fields/numpy_evaluator.py` reads
+        None  # write the trajectory, or the best field: npz that `jaxpose/fields/numpy_evaluator.py` reads
     )
     json: bool = False  # print the numbers as JSON and nothing else
 
@@ -52,7 +69,13 @@ class Config:
             raise ValueError("--bspline-hz: expected a field to fit, PoseNet or B-spline, got none")
         check_least(self, posenet_octaves=0, posenet_layers=1, posenet_width=1, steps=1)
         check_positive(self, "bspline_hz", "recorded_hz")
+        check_positive(self, "position_sigma", "rotation_sigma_deg")
         check_apart("--out", self.out, self.trajectory)
+        if self.estimate and self.imu is None:
+            raise ValueError("--estimate: expected --imu with it, got none")
+        if not self.estimate:
+            alone = ("extrinsics", "position_sigma", "rotation_sigma_deg", "kalibr")
+            check_unused(self, alone, "without --estimate")
 
 
 class Result(NamedTuple):
@@ -71,8 +94,8 @@ class Result(NamedTuple):
     notes: tuple[str, ...]
 
 
-def run(config: Config, on_update: OnUpdate = silent) -> Result:
-    """Fit every field that the config names, and write the best one if it says so.
+def run(config: Config, on_update: OnUpdate = silent) -> "Result | Calibration":
+    """Fit every field that the config names, or estimate what it names, and write what it says.
 
     Args:
         config: the trajectory, and the fields to fit.
@@ -84,10 +107,19 @@ def run(config: Config, on_update: OnUpdate = silent) -> Result:
     Raises:
         DataError, OSError: for what cannot be used.
     """
+    source, trajectory = _trajectory(config)
     on_update(Update("loading JAX", quiet=True))
+    if config.estimate:
+        from jaxpose.cli.fit.calibration import calibrate
+
+        return calibrate(config, source, trajectory, on_update)
+    return _compared(config, source, trajectory, on_update)
+
+
+def _compared(config: Config, source: str, trajectory: Trajectory, on_update: OnUpdate) -> Result:
+    """Every field that the config names, fitted."""
     from jaxpose.cli.fit import candidates as fit_candidates
 
-    source, trajectory = _trajectory(config)
     imu, sensor, notes = (None, None, ())
     if config.imu is not None:
         imu, sensor, notes = fit_candidates.readings(config.imu, trajectory)
@@ -140,8 +172,12 @@ def main(args: Sequence[str] | None = None, prog: str = "jaxpose fit") -> None:
     execute(Command(prog, Config, __doc__, run, report), args)
 
 
-def report(result: Result) -> str:
-    """The fields side by side, and how they were measured."""
+def report(result: "Result | Calibration") -> str:
+    """The fields side by side, or what was estimated, and how it was measured."""
+    if not isinstance(result, Result):
+        from jaxpose.cli.fit.calibration import calibration_report
+
+        return calibration_report(result)
     sensor = result.sensor
     head = ["field", "up to [Hz]", "parameters", "position [mm]", "rotation [deg]"]
     if sensor is not None:

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from jaxpose.datasets.rgbd.euroc_files import IMU_COLUMNS, read_csv, read_extrinsics
 from jaxpose.datasets.types import Recording
 from jaxpose.errors import DataError
+from jaxpose.files.kalibr import is_camchain, read_camchain
 from jaxpose.files.tables import numbered_lines, read_all_numbers, read_stamped, seconds
 from jaxpose.files.trajectories import orthonormal
 from jaxpose.geometry import rigid
@@ -42,10 +43,10 @@ def read_imu(file: Path | str, t0_ns: int = 0) -> Imu:
 
 
 def read_mounting(file: Path | str) -> Float[np.ndarray, "4 4"]:
-    """Read where the camera is on the IMU: `T_BS` of EuRoC's `cam0/sensor.yaml`, or 16 numbers.
+    """Read where the camera is on the IMU: EuRoC's `cam0/sensor.yaml`, Kalibr's camchain, or 16 numbers.
 
     Args:
-        file: A data sheet, or a file with the numbers of a 4x4 matrix.
+        file: A data sheet with `T_BS`, a camchain with `T_cam_imu`, or the numbers of a 4x4 matrix.
 
     Returns:
         `T_body_cam`, its rotation orthonormal.
@@ -54,6 +55,8 @@ def read_mounting(file: Path | str) -> Float[np.ndarray, "4 4"]:
         DataError: Naming the file for another count, for NaN, and for what is no rigid transform.
     """
     file = Path(file)
+    if is_camchain(file):
+        return read_camchain(file).T_body_cam
     if any(line.startswith("T_BS") for _, line in numbered_lines(file)):
         T = read_extrinsics(file)
     else:
@@ -70,7 +73,7 @@ def with_imu(recording: Recording, readings: Path | str, mounting: Path | str) -
         recording: Its `t0_ns` is on the clock of the readings; 0 for one without timestamps, whose readings
             then count from its first frame.
         readings: A file for `read_imu`.
-        mounting: A file for `read_mounting`.
+        mounting: A file for `read_mounting`; the time offset of a camchain is taken off the readings' clock.
 
     Returns:
         The recording with `imu` and `T_body_cam`.
@@ -78,7 +81,10 @@ def with_imu(recording: Recording, readings: Path | str, mounting: Path | str) -
     Raises:
         DataError: As the two.
     """
-    return recording._replace(imu=read_imu(readings, recording.t0_ns), T_body_cam=read_mounting(mounting))
+    imu, offset_s = read_imu(readings, recording.t0_ns), 0.0
+    if is_camchain(mounting):
+        offset_s = read_camchain(mounting).offset_s
+    return recording._replace(imu=imu._replace(t=imu.t - offset_s), T_body_cam=read_mounting(mounting))
 
 
 def imu_notes(recording: Recording, name: Path | str) -> tuple[str, ...]:

@@ -1,0 +1,76 @@
+"""Kalibr's `camchain-imucam`: where a camera is on an IMU, and how far their clocks are apart."""
+
+import math
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxpose.errors import DataError
+from jaxpose.files import atomic
+from jaxpose.geometry import rigid
+
+
+class CameraImu(NamedTuple):
+    """A camera's place on an IMU and in its time."""
+
+    T_body_cam: Float[np.ndarray, "4 4"]
+    offset_s: float  # t_imu = t_cam + offset
+
+
+def write_camchain(path: Path | str, found: CameraImu) -> None:
+    """Write the two keys of `cam0` that say how a camera and an IMU go together.
+
+    Args:
+        path: of the file.
+        found: mounting and time offset.
+    """
+    rows = [", ".join(f"{x:.12g}" for x in row) for row in rigid.inverse(found.T_body_cam)]
+    lines = ["cam0:", "  T_cam_imu:", *(f"  - [{row}]" for row in rows)]
+    lines.append(f"  timeshift_cam_imu: {found.offset_s:.12g}")
+    atomic.write_text(path, "\n".join(lines) + "\n")
+
+
+def is_camchain(path: Path | str) -> bool:
+    """Whether a file names `T_cam_imu`."""
+    return "T_cam_imu" in Path(path).read_text(encoding="utf-8-sig", errors="replace")
+
+
+def read_camchain(path: Path | str) -> CameraImu:
+    """Read the first camera of a `camchain-imucam` file.
+
+    Args:
+        path: of the file.
+
+    Returns:
+        Mounting and time offset, 0 where the file has none.
+
+    Raises:
+        DataError: no rigid `T_cam_imu` in it, or an offset that is no number.
+    """
+    text = re.sub("#.*", "", Path(path).read_text(encoding="utf-8-sig", errors="replace"))
+    first = re.split(r"^cam1[ \t]*:", text, flags=re.MULTILINE)[0]
+    number = r"[-+.\deEnaif]+"
+    rows = re.search(r"T_cam_imu[ \t]*:((?:\s*-?\s*\[?\s*-?\s*\[[^\]]*\]\s*,?\s*\]?){4})", first)
+    words = re.findall(number, re.sub(r"-\s+\[|[\[\],]", " ", rows[1])) if rows else []
+    try:
+        T = np.array([float(word) for word in words]).reshape(4, 4)
+    except ValueError:
+        raise DataError(f"{path}: expected T_cam_imu of cam0 with 4 rows of 4 numbers") from None
+    if (
+        not np.isfinite(T).all()
+        or np.abs(T[3] - [0, 0, 0, 1]).max() > 1e-6
+        or not rigid.is_rotation(T[:3, :3], 1e-3)
+    ):
+        raise DataError(f"{path}: expected T_cam_imu to be a rigid transform, got {T.round(4).tolist()}")
+    T[:3, :3] = rigid.nearest_rotation(T[:3, :3])
+    shift = re.search(r"timeshift_cam_imu[ \t]*:[ \t]*(\S+)", first)
+    try:
+        offset = float(shift[1]) if shift else 0.0
+    except ValueError:
+        offset = math.nan
+    if not math.isfinite(offset):
+        raise DataError(f"{path}: expected timeshift_cam_imu in seconds, got {shift[1] if shift else ''!r}")
+    return CameraImu(rigid.inverse(T), offset)
