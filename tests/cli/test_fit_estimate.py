@@ -100,7 +100,7 @@ def test_what_cannot_be_is_refused(files, tmp_path):
         poses, "--kalibr", tmp_path / "chain.yaml"
     )
     assert "got nothing" in complaint(poses, "--imu", tmp_path / "none.txt", "--estimate", "scale")
-    assert "expected" in complaint(poses, "--imu", imu, "--estimate", "wind")
+    assert "invalid choice 'wind'" in complaint(poses, "--imu", imu, "--estimate", "wind")
     late = tmp_path / "late.txt"
     lines = [line.split(" ", 1) for line in imu.read_text().splitlines()]
     late.write_text("\n".join(f"{float(t) + 1000:.6f} {rest}" for t, rest in lines))
