@@ -17,8 +17,10 @@ from helpers.refused import complaint
 from PIL import Image
 
 from jaxpose import fields
+from jaxpose.cli import evaluate
 from jaxpose.datasets.synthetic import RoomConfig, room
 from jaxpose.datasets.types import Recording
+from jaxpose.errors import DataError
 from jaxpose.evaluation import trajectory_error
 from jaxpose.experiments import imu_slam, rgbd_slam
 from jaxpose.experiments.outcome import Outcome
@@ -108,6 +110,19 @@ def test_a_saved_field_gives_the_trajectory_at_any_time(finished):
     )
     assert sigma.shape == (len(times), 6) and (sigma > 1e-6).all() and (sigma < 0.1).all()
     np.testing.assert_allclose(numpy_evaluator.load(folder / "field.npz")(times), poses, atol=1e-6)
+
+
+def test_errors_are_held_against_the_covariances(finished, tmp_path):
+    """`jaxpose eval --consistency` of a run, and one line for a trajectory that does not know."""
+    folder = finished.folder
+    config = evaluate.Config(folder, folder / "reference.txt", consistency=True)
+    found = evaluate.run(config)
+    pose, second = found.consistency["poses after alignment"], found.consistency["moves of 1 s"]
+    assert pose.count == FRAMES and 0 < second.count < FRAMES
+    assert 0 < pose.nees < 100 and 0 < second.nees < 100
+    assert f"{second.nees:.2f} of moves of 1 s" in evaluate.report(found)
+    with pytest.raises(DataError, match="--consistency expected a run"):
+        evaluate.run(evaluate.Config(folder / "trajectory.txt", folder / "reference.txt", consistency=True))
 
 
 def test_a_run_says_what_camera_it_had(finished):

@@ -183,9 +183,13 @@ def test_covariances_are_kept_and_interpolated(tmp_path):
     """At the times that were written, between them, and a line for what is not known."""
     times, P = np.array([0.5, 1.0, 2.0]), np.stack([np.diag([k + 1.0] * 6) for k in range(3)])
     field, params = fields.bspline(SPAN, 4), jnp.zeros((7, 7))
-    serialization.save(tmp_path / "field.npz", field, params, covariance=(times, P))
+    serialization.save(
+        tmp_path / "field.npz", field, params, covariance=fields.Covariances(times, P, 2 * P[:2])
+    )
     found = numpy_evaluator.load_covariance(tmp_path / "field.npz")
     np.testing.assert_allclose(found([0.5, 1.5, 2.0]), [P[0], np.diag([2.5] * 6), P[2]])
+    later = numpy_evaluator.load_covariance(tmp_path / "field.npz", "relative_covariance")
+    np.testing.assert_allclose(later(0.75), [np.diag([3.0] * 6)])
     assert serialization.load(tmp_path / "field.npz")[0] == field
     with pytest.raises(ValueError, match="expected times between 0.5 and 2 s"):
         found(2.5)

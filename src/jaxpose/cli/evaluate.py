@@ -17,6 +17,7 @@ from jaxtyping import Float
 from jaxpose.cli.source import FIELD, Source, read_field, read_source
 from jaxpose.errors import DataError
 from jaxpose.evaluation import trajectory_error
+from jaxpose.evaluation.consistency import Consistency, aligned_error, consistency, relative_error
 from jaxpose.evaluation.trajectory_error import Alignment, Statistics
 from jaxpose.experiments.checks import check_finite, check_least, check_positive
 from jaxpose.experiments.command import Command, execute
@@ -26,6 +27,7 @@ from jaxpose.files import trajectories
 from jaxpose.geometry import rigid
 from jaxpose.geometry.rigid import Similarity
 
+_INDEPENDENT_S = 0.5
 Unit = Literal["frames", "s", "m"]
 _ALIGNMENTS = {
     "none": "none: poses are compared as they are",
@@ -53,6 +55,7 @@ class Config:
     rpe_frames: tuple[int, ...] = (1,)  # relative errors over so many poses
     rpe_seconds: tuple[float, ...] = (1.0,)  # relative errors over so much time [s]
     rpe_metres: tuple[float, ...] = ()  # relative errors over so much of the reference's path [m]
+    consistency: bool = False  # whether errors are as large as the covariances of a run's field.npz say
     plot: Path | None = None  # PNG to draw both trajectories and the errors in
     json: bool = False  # print the numbers as JSON and nothing else
 
@@ -86,6 +89,7 @@ class Result(NamedTuple):
     ate_m: Statistics
     rotation_deg: Statistics
     rpe: tuple[Relative, ...]
+    consistency: dict[str, Consistency] | None  # of poses, and of moves of one second
     notes: tuple[str, ...]
     plot: Path | None
 
@@ -98,6 +102,7 @@ class _Pairs(NamedTuple):
     reference: Float[np.ndarray, "n 4 4"]
     how: str
     stamped: bool
+    exact: bool = False  # of the continuous trajectory
 
 
 def run(config: Config, on_update: OnUpdate = silent) -> Result:
@@ -120,6 +125,7 @@ def run(config: Config, on_update: OnUpdate = silent) -> Result:
     aligned = trajectory_error.align(ate.alignment, pairs.estimate)
     turned = np.degrees(rigid.rotation_angle(aligned[:, :3, :3], pairs.reference[:, :3, :3]))
     rpe, notes = _relative(config, pairs)
+    consistent = _consistency(config, pairs, ate.alignment) if config.consistency else None
     if config.plot is not None:
         on_update(Update("drawing figures", quiet=True))
         from jaxpose.plots.evaluation import comparison
@@ -144,6 +150,7 @@ def run(config: Config, on_update: OnUpdate = silent) -> Result:
         ate_m=trajectory_error.statistics(ate.errors),
         rotation_deg=trajectory_error.statistics(turned),
         rpe=rpe,
+        consistency=consistent,
         notes=notes,
         plot=config.plot,
     )
@@ -182,6 +189,14 @@ def report(result: Result) -> str:
         "  ATE: distance of positions after alignment; rotation: angle between orientations after it;",
         "  RPE: error of the motion between two poses so far apart (s, m: within a tenth), all such pairs",
     ]  # fmt: skip
+    for name, found in (result.consistency or {}).items():
+        low, high = found.band
+        lines.append(_line(
+            "NEES",
+            f"{found.nees:.2f} of {name}, expected {low:.2f} to {high:.2f} (95%, {found.independent} "
+            f"independent errors); {100 * found.inside_50:.0f}% and {100 * found.inside_90:.0f}% of "
+            f"{found.count} inside the 50 and 90% ellipsoids",
+        ))  # fmt: skip
     lines += [_line("note", note) for note in result.notes]
     if result.plot is not None:
         lines.append(_line("drawn in", str(result.plot)))
@@ -234,7 +249,41 @@ def _exact(config: Config, estimate: Source, reference: Source) -> _Pairs:
     how = f"exact: the continuous trajectory ({FIELD}) at the reference's timestamps"
     how += f"; {outside} timestamps of the reference beyond its ends are left out" if outside else ""
     how += f"; the estimate's clock moved by {config.time_offset_s:g} s" if config.time_offset_s else ""
-    return _Pairs(reference.trajectory.t[inside], pose(t[inside]), reference.trajectory.T[inside], how, True)
+    of_reference = reference.trajectory.T[inside]
+    return _Pairs(reference.trajectory.t[inside], pose(t[inside]), of_reference, how, True, exact=True)
+
+
+def _consistency(config: Config, pairs: _Pairs, alignment: Similarity) -> dict[str, Consistency]:
+    """Squared errors over the covariances of a run's file, of poses and of moves of one second.
+
+    Errors half a second apart and more are counted as independent.
+    """
+    from jaxpose.fields import numpy_evaluator
+
+    file = config.estimate / FIELD
+    if not pairs.exact:
+        raise DataError(f"{config.estimate}: --consistency expected a run and timestamps, to match exactly")
+    try:
+        of_pose, of_second = (
+            numpy_evaluator.load_covariance(file, name) for name in ("covariance", "relative_covariance")
+        )
+    except ValueError as error:
+        raise DataError(str(error)) from None
+    t = pairs.t - config.time_offset_s
+    P = of_pose(t)
+    aligned = trajectory_error.align(alignment, pairs.estimate)
+    error = aligned_error(aligned, pairs.reference, P)
+    independent = lambda t: max(int((t[-1] - t[0]) / _INDEPENDENT_S), 1)
+    found = {"poses after alignment": consistency(error, P, independent=independent(t))}
+    later = np.searchsorted(t, t + 1.0 - 1e-6)
+    i = np.flatnonzero((later < len(t)) & (np.abs(t[np.minimum(later, len(t) - 1)] - t - 1.0) < 1e-3))
+    if len(i):
+        j = later[i]
+        moves = relative_error(
+            (pairs.estimate[i], pairs.estimate[j]), (pairs.reference[i], pairs.reference[j])
+        )
+        found["moves of 1 s"] = consistency(moves, of_second(t[i]), independent=independent(t[i]))
+    return found
 
 
 def _relative(config: Config, pairs: _Pairs) -> tuple[tuple[Relative, ...], tuple[str, ...]]:

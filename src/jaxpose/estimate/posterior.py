@@ -22,11 +22,12 @@ from jaxpose.estimate.system import (
     State,
     camera_rows,
 )
-from jaxpose.fields import Params, PoseField, bspline
+from jaxpose.fields import Covariances, Params, PoseField, bspline
 from jaxpose.fields._bspline import control_rows
 from jaxpose.fields.types import Span
 from jaxpose.geometry import rigid, se3
 
+_TABLE_HZ = 20.0  # of covariances in files
 _UNOBSERVED = 0.1  # share of what was known before
 
 
@@ -132,6 +133,15 @@ class Posterior(NamedTuple):
             carried = -np.asarray(se3.adjoint(jnp.asarray(rigid.inverse(T_b) @ T_a))) @ J_a
             found = _joint(self.factor, carried, pair_a, J_b, pair_b)
             return np.asarray(found)
+
+    def covariances(self) -> Covariances:
+        """Covariances of poses and of moves of one second, 20 times a second, as `fields.save` takes them."""
+        first, last = self.span
+        t = first + np.arange(int((last - first) * _TABLE_HZ) + 1) / _TABLE_HZ
+        t = t if last - t[-1] < 1e-9 else np.append(t, last)
+        early = t[t + 1.0 <= last]
+        second = self.relative_covariance(early, early + 1.0) if len(early) else np.zeros((0, 6, 6))
+        return Covariances(t, self.covariance(t), second)
 
     def field(self) -> tuple[PoseField, Params]:
         """The camera's trajectory as a B-spline on the poses' clock, and its parameters.

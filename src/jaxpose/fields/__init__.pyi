@@ -27,6 +27,7 @@ from .derivatives import velocity as velocity
 from .fitting import FitResult as FitResult
 from .fitting import fit as fit
 from .projection import project_onto_poses as project_onto_poses
+from .serialization import Covariances as Covariances
 from .serialization import load as load
 from .serialization import save as save
 from .types import Params as Params

@@ -33,23 +33,25 @@ def load(path):
     return pose
 
 
-def load_covariance(path):
+def load_covariance(path, name="covariance"):
     """How sure a trajectory is.
 
     Args:
         path: a `field.npz` of a run that knows.
+        name: "covariance", of the pose, or "relative_covariance", of the move in the second that follows.
 
     Returns:
         A function of times (n,) [s] to covariances (n, 6, 6) of the increment [translation, rotation] (m,
-        rad) on the right of the pose. It raises a ValueError for times beyond those that are known.
+        rad) on the right. It raises a ValueError for times beyond those that are known.
 
     Raises:
         ValueError: a file without covariances.
     """
     with np.load(path, allow_pickle=False) as file:
-        if "covariance" not in file:
-            raise ValueError(f"{path}: expected covariances, got a trajectory without")
-        times, known = file["covariance_times"], file["covariance"]
+        if name not in file:
+            raise ValueError(f"{path}: expected {name}, got a trajectory without")
+        times, known = file["covariance_times"], file[name]
+        times = times[: len(known)]
 
     def covariance(t):
         t = np.atleast_1d(np.asarray(t, float))

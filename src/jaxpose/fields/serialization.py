@@ -24,10 +24,13 @@ Where it is known how sure the pose is, the file holds too
     covariance_times   (m,) increasing [s]
     covariance         (m, 6, 6) at those times, to be interpolated: of the increment [translation, rotation]
                        (m, rad) on the right of the pose, along and about the camera's own axes
+    relative_covariance   (k, 6, 6) at the first k of those times: the same of the pose one second later, seen
+                       from the pose
 """
 
 import zipfile
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -48,13 +51,21 @@ _FROM_FACTOR = {
 }
 
 
+class Covariances(NamedTuple):
+    """How sure a trajectory is, of increments [translation, rotation] [m, rad] on the right."""
+
+    t: Float[np.ndarray, " m"]  # [s], increasing
+    pose: Float[np.ndarray, "m 6 6"]
+    second: Float[np.ndarray, "k 6 6"]  # of the pose a second later seen from it, at the first k times
+
+
 def save(
     path: Path | str,
     field: PoseField,
     params: Params,
     *,
     alignment: Similarity | None = None,
-    covariance: tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m 6 6"]] | None = None,
+    covariance: Covariances | None = None,
 ) -> None:
     """Write a field with its parameters to a file, as this module describes it.
 
@@ -64,7 +75,7 @@ def save(
             cannot be saved.
         params: its parameters.
         alignment: what the poses are moved by, as `trajectory_error.align` does: scaled, turned and moved.
-        covariance: times [s] and the covariances of the pose there, where they are known.
+        covariance: how sure the pose is, where that is known.
 
     Raises:
         ValueError: the field, or a part of it, has no description.
@@ -79,9 +90,13 @@ def save(
         factors = (moved, *(_scaled(factor, alignment.scale) for factor in factors))
     known = {}
     if covariance is not None:
-        check_shapes(times=(covariance[0], "m"), covariance=(covariance[1], "m 6 6"))
+        check_shapes(t=(covariance.t, "m"), pose=(covariance.pose, "m 6 6"))
+        check_shapes(second=(covariance.second, "k 6 6"))
         lengths = np.repeat([1.0 if alignment is None else alignment.scale, 1.0], 3)
-        known = {"covariance_times": covariance[0], "covariance": covariance[1] * np.outer(lengths, lengths)}
+        units = np.outer(lengths, lengths)
+        known = {"covariance_times": covariance.t, "covariance": covariance.pose * units}
+        if len(covariance.second):
+            known["relative_covariance"] = covariance.second * units
     entries = {f"{k}.{name}": value for k, factor in enumerate(factors) for name, value in factor.items()}
     with atomic(path) as temporary:
         np.savez(

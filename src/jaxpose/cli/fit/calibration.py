@@ -19,7 +19,6 @@ from jaxpose.geometry import rigid
 from jaxpose.geometry.rigid import Similarity
 from jaxpose.imu import Imu, ImuNoise
 
-_COVARIANCE_HZ = 20.0  # of what is written
 _WRONG = 2.0  # times its data sheet: then a noise is reported
 
 
@@ -151,8 +150,7 @@ def _readings(path: Path, t0: float) -> tuple[Imu, ImuNoise | None]:
 
 def _write(out: Path, known: Posterior, t0: float) -> None:
     field, params = known.field()
-    first, last = known.span
-    times = np.linspace(first, last, int(np.ceil((last - first) * _COVARIANCE_HZ)) + 1)
+    covariance = known.covariances()
     up = np.eye(3)
     if "gravity" in known.estimated:
         g = known.sensors.gravity_world / np.linalg.norm(known.sensors.gravity_world)
@@ -166,7 +164,7 @@ def _write(out: Path, known: Posterior, t0: float) -> None:
         shifted(field, t0),
         params,
         alignment=Similarity(1.0, up, np.zeros(3)),
-        covariance=(times + t0, known.covariance(times)),
+        covariance=covariance._replace(t=covariance.t + t0),
     )
 
 

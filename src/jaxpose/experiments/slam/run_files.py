@@ -32,8 +32,6 @@ from jaxpose.slam.initial_pose import first_pose
 from jaxpose.slam.keyframes import keyframe_images
 from jaxpose.slam.map.mesh import mesh, point_cloud
 
-_COVARIANCE_HZ = 20.0  # of the covariances in field.npz
-
 
 def write_run(
     folder: Path, options: Options, source: Source, result: SlamResult, on_update: OnUpdate
@@ -79,18 +77,8 @@ def _write_trajectory(folder: Path, recording: Recording, result: SlamResult) ->
     trajectories.write_tum(folder / "trajectory.txt", trajectories.Trajectory(t, result.T_world_cam))
     if ground_truth is not None:
         trajectories.write_tum(folder / "reference.txt", trajectories.Trajectory(t, ground_truth))
-    known = result.posterior
-    if known is None:
-        save(folder / "field.npz", result.field, result.field_params)
-        return
-    first, last = known.span
-    times = np.linspace(first, last, int(np.ceil((last - first) * _COVARIANCE_HZ)) + 1)
-    save(
-        folder / "field.npz",
-        result.field,
-        result.field_params,
-        covariance=(times, known.covariance(times)),
-    )
+    known = None if result.posterior is None else result.posterior.covariances()
+    save(folder / "field.npz", result.field, result.field_params, covariance=known)
 
 
 def _write_surface(folder: Path, recording: Recording, result: SlamResult) -> tuple[str, ...]:
