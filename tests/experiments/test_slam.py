@@ -24,11 +24,13 @@ from jaxpose.errors import DataError
 from jaxpose.evaluation import trajectory_error
 from jaxpose.experiments import imu_slam, rgbd_slam
 from jaxpose.experiments.outcome import Outcome
+from jaxpose.experiments.slam.evaluation import orientation_error_deg
 from jaxpose.experiments.slam.report import report, table, tracking_update
 from jaxpose.experiments.slam.source import load
 from jaxpose.fields import numpy_evaluator
 from jaxpose.files import atomic, trajectories
 from jaxpose.files.camera_json import read_camera
+from jaxpose.geometry import rigid
 from jaxpose.slam import Progress
 
 README = Path(__file__).parents[2] / "README.md"
@@ -123,6 +125,21 @@ def test_errors_are_held_against_the_covariances(finished, tmp_path):
     assert f"{second.nees:.2f} of moves of 1 s" in evaluate.report(found)
     with pytest.raises(DataError, match="--consistency expected a run"):
         evaluate.run(evaluate.Config(folder / "trajectory.txt", folder / "reference.txt", consistency=True))
+
+
+def test_a_camera_that_turns_in_place_is_not_called_wrong():
+    """Its positions do not tell how to turn it; its orientations, all off by the same 30 degrees, do."""
+    rng, turns = np.random.default_rng(0), np.zeros((40, 6))
+    turns[:, 4] = np.linspace(0, 2, 40)
+    true = rigid.exp(turns)
+    world = rigid.exp(np.array([0.0, 0.0, 0.0, 0.5, 0.1, 0.0]))
+    off = np.zeros((40, 6))
+    off[7, 3], off[:, :3] = np.radians(8), 0.002 * rng.normal(size=(40, 3))
+    estimate = world @ true @ rigid.exp(off)
+    true[3] = np.nan
+    turned = orientation_error_deg(estimate, true)
+    assert np.flatnonzero(turned > 5).tolist() == [7] and turned[7] == pytest.approx(8, abs=0.3)
+    assert np.isnan(turned[3]) and np.nanmedian(turned) < 0.3
 
 
 def test_a_run_says_what_camera_it_had(finished):

@@ -126,7 +126,8 @@ def accuracy(
     ate = trajectory_error.ate(result.T_world_cam, T_world_true)
     aligned = trajectory_error.align(ate.alignment, result.T_world_cam)
     rotation_deg = np.degrees(rigid.rotation_angle(aligned[:, :3, :3], T_world_true[:, :3, :3]))
-    wrong = (ate.errors > _WRONG_M) | (rotation_deg > _WRONG_DEG)  # NaN, without ground truth, is neither
+    turned_deg = orientation_error_deg(result.T_world_cam, T_world_true)
+    wrong = (ate.errors > _WRONG_M) | (turned_deg > _WRONG_DEG)  # NaN, without ground truth, is neither
     field = jax.jit(jax.vmap(result.field.pose, (None, 0)))
     since_first = jnp.asarray(t - t[0], jnp.float32)
     field_poses = np.asarray(field(result.field_params, since_first), np.float64)
@@ -142,6 +143,28 @@ def accuracy(
         "field_ate_rmse_m": trajectory_error.ate(field_poses, T_world_true).rmse,
     }
     return Accuracy(aligned, ate.errors, rotation_deg, numbers)
+
+
+def orientation_error_deg(
+    T_world_cam: Float[np.ndarray, "n 4 4"], T_world_true: Float[np.ndarray, "n 4 4"]
+) -> Float[np.ndarray, " n"]:
+    """Errors of orientations less their mean.
+
+    An alignment of positions turns the trajectory of a camera that hardly moves as it likes; this does not.
+
+    Args:
+        T_world_cam: estimated poses.
+        T_world_true: ground truth, rows of NaN where there is none.
+
+    Returns:
+        Errors [deg], NaN where there is no ground truth.
+    """
+    known = np.isfinite(T_world_true).all(axis=(1, 2))
+    R, R_true = T_world_cam[:, :3, :3], T_world_true[:, :3, :3]
+    mean = rigid.nearest_rotation((R_true[known] @ np.swapaxes(R[known], 1, 2)).mean(0))
+    turned = np.full(len(R), np.nan)
+    turned[known] = np.degrees(rigid.rotation_angle(mean @ R[known], R_true[known]))
+    return turned
 
 
 def _drift(T_world_cam: Float[np.ndarray, "n 4 4"], T_world_true: Float[np.ndarray, "n 4 4"]):
