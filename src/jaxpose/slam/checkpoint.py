@@ -78,7 +78,9 @@ def _as_arrays(state: SlamState, size: dict[str, Any], blocks: int | None = None
     numbers = {name: np.asarray(getattr(state, name)) for name in ("max_depth", "duration_s")}
     motion = state.motion._replace(gyro_bias_sigma=np.asarray(state.motion.gyro_bias_sigma))
     state = state._replace(**numbers, motion=motion, camera=None, config=None, grid=None)
-    state = state._replace(features=None, keyframe_features=(), images=())  # the recording gives them again
+    state = state._replace(
+        features=None, keyframe_features=(), images=(), readings=()
+    )  # the recording gives them again
     if state.map is not None and hasattr(state.map.params, "table"):
         rows = packed(state.map.params)
         if blocks is not None:

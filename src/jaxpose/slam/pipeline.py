@@ -22,7 +22,7 @@ from jaxpose.geometry.camera import Camera, angle_of_view
 from jaxpose.imu import GRAVITY_WORLD, Gravity, Imu
 from jaxpose.scenes import SceneField
 from jaxpose.scenes.voxel_blocks import BlockConfig, Blocks, blocks_of_grid, voxel_blocks
-from jaxpose.slam.batch import final_trajectory
+from jaxpose.slam.batch import all_readings, final_trajectory
 from jaxpose.slam.config import SlamConfig
 from jaxpose.slam.initial_pose import first_pose, upright_pose
 from jaxpose.slam.keyframes import FrameReader, keyframe_images, thumbnail
@@ -123,6 +123,7 @@ def init(
         features=None,
         keyframe_features=(),
         images=(),
+        readings=(),
         grid=None,
         map=None,
     )
@@ -166,6 +167,9 @@ def step(
     if state.frames.keyframe[-1]:
         kept = Frame(np.array(frame.rgb), np.array(frame.depth))
         state = state._replace(images=(*state.images, kept))
+    if imu is not None and state.config.uses_gyroscope:
+        came = Imu(*(np.array(x, np.float64) for x in imu))
+        state = state._replace(readings=(*state.readings, came))
     return state
 
 
@@ -178,7 +182,7 @@ def finish(state: SlamState) -> SlamResult:
     Raises:
         DataError: for fewer than two frames.
     """
-    return _finish(state, lambda i: _kept_image(state, i), None)
+    return _finish(state, lambda i: _kept_image(state, i), all_readings(state.readings))
 
 
 def run(

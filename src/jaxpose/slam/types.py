@@ -153,5 +153,6 @@ class SlamState(NamedTuple):
     features: Features | None  # of the last frame; None: not used, or before the first
     keyframe_features: tuple[Features, ...]
     images: tuple[Frame, ...]  # of the keyframes, where no recording can give them again
+    readings: tuple[Imu, ...]  # all of them, as they came, where no recording can give them again
     grid: BlockConfig | GridConfig | None  # how finely the map resolves space; None: before the first frame
     map: MapState | None
