@@ -15,7 +15,6 @@ from jaxpose.slam.tracking.feature_pose import feature_nis, seen_pose, with_feat
 from jaxpose.slam.tracking.features import Features
 from jaxpose.slam.tracking.predict import (
     BEHIND,
-    COMMON_ERRORS,
     MotionPrediction,
     TrackingProblem,
     constant_velocity,
@@ -108,8 +107,7 @@ def _predict(state: SlamState) -> MotionPrediction:
     if first:
         sigma = sigma + [0.3 * dt, 0.0 if config.uses_gyroscope else 0.3 * dt]  # as fast as a hand may move
     covariance = np.diag(np.repeat(sigma**2, 3))
-    common = COMMON_ERRORS if config.uses_gyroscope else 1.0
-    return MotionPrediction(dt, timestamps, T_ref_body, covariance, np.zeros((6, 6)), readings, common)
+    return MotionPrediction(dt, timestamps, T_ref_body, covariance, np.zeros((6, 6)), readings)
 
 
 def _update_state(
@@ -261,7 +259,7 @@ def _problem(
         as_float(predicted.dt),
         as_float(timestamps),
         as_float(np.concatenate([predicted.T_ref_body, past])),
-        as_float(predicted.common * predicted.covariance),
+        as_float(predicted.covariance),
         as_float(predicted.support),
         predicted.readings,
         jax.tree.map(as_float, imu_sigmas(config.imu_noise, imu, predicted.dt)),

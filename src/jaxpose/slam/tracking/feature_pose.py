@@ -7,11 +7,14 @@ from jaxpose.datasets.types import Frame
 from jaxpose.geometry import rigid
 from jaxpose.slam.keyframes import unlikeness
 from jaxpose.slam.tracking.features import FeaturePose, Features, locate_camera
-from jaxpose.slam.tracking.predict import COMMON_ERRORS, MotionPrediction, constant_velocity
+from jaxpose.slam.tracking.predict import MotionPrediction, constant_velocity
 from jaxpose.slam.tracking.register import Tracked
 from jaxpose.slam.types import Frames, SlamState
 
 _USUAL = 30  # frames that say what is usual
+# Errors of poses by features that stay from frame to frame (colour beside depth, a rolling shutter), which no
+# number of frames averages out.
+_GO_TOGETHER = 10.0
 _ENOUGH = 60  # features of keyframes: with fewer those of the last frame are taken too, which drift
 _MATCHED = 3  # images that a frame's features are matched with
 _FIRST_SCALE = 30.0  # of the covariance of poses by features, before any has been compared: measured 6 to 200
@@ -79,20 +82,20 @@ def with_features(
     lead there.
     """
     frames, i, T_body_cam = state.frames, state.frames.count - 1, state.T_body_cam
-    support = np.linalg.inv(seen.covariance) / COMMON_ERRORS
+    support = np.linalg.inv(seen.covariance) / _GO_TOGETHER
     if frames.doubted[i - 1]:
         T_predicted = frames.T_world_body[i - 1] @ predicted.T_ref_body[-1]
         T_world_body = seen.T_world_cam @ rigid.inverse(T_body_cam)
         frames = frames.corrected(rigid.inverse(T_predicted) @ T_world_body)
-        covariance, fused = COMMON_ERRORS * seen.covariance, T_world_body
+        covariance, fused = _GO_TOGETHER * seen.covariance, T_world_body
     else:
         T_world_predicted = _predicted_camera(state, frames, predicted)
         apart = rigid.log(rigid.inverse(seen.T_world_cam) @ T_world_predicted)
-        before = predicted.common * predicted.covariance
-        both, expected = seen.covariance + before, np.linalg.inv(before)
+        both = seen.covariance + predicted.covariance
+        expected = np.linalg.inv(predicted.covariance)
         if apart @ np.linalg.solve(both, apart) > _CHI2_999:
             expected = np.zeros((6, 6))
-        share = np.linalg.solve(COMMON_ERRORS * support + expected, expected)
+        share = np.linalg.solve(_GO_TOGETHER * support + expected, expected)
         fused = seen.T_world_cam @ rigid.exp(share @ apart) @ rigid.inverse(T_body_cam)
         covariance = np.linalg.inv(support + expected)
     T_ref_body = rigid.inverse(frames.T_world_body[i - 1]) @ fused

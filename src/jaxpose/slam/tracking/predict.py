@@ -14,9 +14,6 @@ from jaxpose.slam.tracking.reference_frames import ReferenceFrame
 
 AHEAD = 8  # timestamps of a predicted motion
 GYRO_BIAS_SIGMA = 0.1  # [rad/s] of a gyroscope of which nothing is known yet
-# Times the covariance of what has errors that stay from frame to frame (of features: colour beside depth, a
-# rolling shutter; of an IMU: clock, mounting, biases), which no number of frames averages out.
-COMMON_ERRORS = 10.0
 BEHIND = 3  # frames before the last one that the field keeps to
 _SMALLEST_WINDOW = 16  # readings; windows are padded to powers of two, so that few shapes are compiled
 
@@ -33,7 +30,6 @@ class MotionPrediction(NamedTuple):
     covariance: Float[np.ndarray, "6 6"]  # of it at dt, over right increments of the camera [m, rad]
     support: Float[np.ndarray, "6 6"]  # the information in it that comes from features of this frame
     readings: "PreintegratedImu"
-    common: float = 1.0  # times its covariance it counts against the image: `COMMON_ERRORS` by an IMU
 
     @property
     def sigma(self) -> Float[np.ndarray, "2"]:
@@ -187,7 +183,6 @@ def constant_velocity(
         T_ref_body=T_ref_body,
         covariance=covariance,
         support=np.zeros((6, 6)) if support is None else support,
-        common=1.0,
     )
 
 
