@@ -125,10 +125,10 @@ def test_covariances_of_a_linear_problem_are_those_of_dense_algebra():
     for sigma, rest, axis in ((0.01, 1e-3, 0), (0.02, 1e-3, 3)):
         P = np.linalg.inv(values.T @ values / sigma**2 + prior / rest**2)
         expected = np.einsum("ni,ij,nj->n", values, P, values)
-        np.testing.assert_allclose(found.covariance(t)[:, axis, axis], expected, rtol=1e-6)
+        np.testing.assert_allclose(found.covariance(t)[:, axis, axis], expected, rtol=1e-9)
         between = values[20] - values[5]
         relative = found.relative_covariance(t[5], t[20])[0, axis, axis]
-        np.testing.assert_allclose(relative, between @ P @ between, rtol=1e-6)
+        np.testing.assert_allclose(relative, between @ P @ between, rtol=1e-9)
 
 
 @pytest.mark.slow

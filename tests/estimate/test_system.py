@@ -27,7 +27,7 @@ def test_the_motion_is_that_of_the_field_by_forward_mode(control):
         field = fields.bspline(SPAN, INTERVALS)
         for index, u in ((0, 0.3), (3, 0.9), (5, 0.5)):
             segment = jax.tree.map(lambda x, i=index: x[i], segments(jnp.asarray(control)))
-            at = kinematics(segment, basis(jnp.asarray(u), 0.2))
+            at = kinematics(segment, basis(jnp.asarray(u), jnp.asarray(0.2)))
             there = fields.motion(lambda t: field.pose(points, t), (index + u) * 0.2)
             R = np.asarray(there.pose[:3, :3])
             np.testing.assert_allclose(at.T, there.pose, atol=1e-12)

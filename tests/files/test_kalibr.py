@@ -35,7 +35,8 @@ def test_the_first_camera_of_a_chain_is_read(tmp_path):
     np.testing.assert_allclose(T_body_cam[:3, :3], [[0, 0, 1], [-1, 0, 0], [0, -1, 0]], atol=1e-12)
     np.testing.assert_allclose(T_body_cam[:3, 3], [-0.03, 0.01, -0.02], atol=1e-12)
     assert offset_s == -0.0071
-    np.testing.assert_array_equal(read_mounting(file), T_body_cam)
+    np.testing.assert_array_equal(read_mounting(file).T_body_cam, T_body_cam)
+    assert read_mounting(file).offset_s == offset_s
 
 
 def test_what_is_written_is_read(tmp_path):

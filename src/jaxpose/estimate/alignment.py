@@ -1,20 +1,36 @@
 """Where an estimate starts: time offset, mounting, scale and gravity, from poses and readings alone."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation, Slerp
 
 from jaxpose.errors import DataError
 from jaxpose.geometry import rigid
-from jaxpose.imu import Imu
+from jaxpose.imu import Imu, integrate_gyro
 
 _STEP_S = 0.005  # between the offsets that are tried
+
+
+def gyro_orientation(imu: Imu) -> Slerp:
+    """The orientation that the gyroscope's readings add up to, from the first on.
+
+    Args:
+        imu: readings (n,), float64.
+
+    Returns:
+        A function of times within the readings' (m,) [s].
+    """
+    with jax.enable_x64(True):
+        R = integrate_gyro(jnp.eye(3), jnp.asarray(imu.t), jnp.asarray(imu.omega_body))
+    return Slerp(np.asarray(imu.t), Rotation.from_matrix(np.asarray(R)))
 
 
 def rotation_alignment(
     t: Float[np.ndarray, " n"],
     R_world_cam: Float[np.ndarray, "n 3 3"],
-    imu: Imu,
+    turned: Slerp,
     reach_s: float,
     R_body_cam: Float[np.ndarray, "3 3"] | None = None,
 ) -> tuple[float, Float[np.ndarray, "3 3"]]:
@@ -27,7 +43,7 @@ def rotation_alignment(
     Args:
         t: times of the poses (n,) [s].
         R_world_cam: orientations (n, 3, 3).
-        imu: readings.
+        turned: `gyro_orientation` of the readings.
         reach_s: offsets from -reach_s to reach_s are tried; 0: only none.
         R_body_cam: the mounting where it is known.
 
@@ -37,16 +53,16 @@ def rotation_alignment(
     Raises:
         DataError: where the readings overlap with fewer than four poses.
     """
-    integrated = _integrated(imu)
+    start, *_, end = np.asarray(turned.times)
     steps = int(np.ceil(reach_s / _STEP_S))
     seen = rigid.so3_log(np.swapaxes(R_world_cam[:-1], 1, 2) @ R_world_cam[1:])
     best = None
     for offset in _STEP_S * np.arange(-steps, steps + 1):
         at = t + offset
-        inside = (at[:-1] >= imu.t[0]) & (at[1:] <= imu.t[-1])
+        inside = (at[:-1] >= start) & (at[1:] <= end)
         if inside.sum() < 3:
             continue
-        R = integrated(np.clip(at, imu.t[0], imu.t[-1])).as_matrix()
+        R = turned(np.clip(at, start, end)).as_matrix()
         dt = np.diff(t)[inside, None]
         read = rigid.so3_log(np.swapaxes(R[:-1], 1, 2) @ R[1:])[inside] / dt
         rate = seen[inside] / dt
@@ -61,7 +77,7 @@ def rotation_alignment(
     if best is None:
         raise DataError(
             f"IMU: expected readings between {t[0]:.3f} and {t[-1]:.3f} s (the poses), got them between "
-            f"{imu.t[0]:.3f} and {imu.t[-1]:.3f} s"
+            f"{start:.3f} and {end:.3f} s"
         )
     return float(best[1]), best[2]
 
@@ -70,6 +86,7 @@ def scale_and_gravity(
     t: Float[np.ndarray, " n"],
     T_world_cam: Float[np.ndarray, "n 4 4"],
     imu: Imu,
+    turned: Slerp,
     R_body_cam: Float[np.ndarray, "3 3"],
     gravity_m_s2: float,
     *,
@@ -86,6 +103,7 @@ def scale_and_gravity(
         t: times of the poses [s] on the IMU's clock.
         T_world_cam: poses (n, 4, 4).
         imu: readings.
+        turned: their `gyro_orientation`.
         R_body_cam: mounting.
         gravity_m_s2: size of gravity.
         scale: of the positions where it is known.
@@ -93,7 +111,7 @@ def scale_and_gravity(
     Returns:
         The scale, and gravity (3,) in the world of the poses, of the given size.
     """
-    times, force = _forces(t, T_world_cam[:, :3, :3] @ R_body_cam.T, imu)
+    times, force = _forces(t, T_world_cam[:, :3, :3] @ R_body_cam.T, imu, turned)
     step = np.gradient(times)
     # over a tent of two intervals, the mean of acceleration is the change of mean velocity
     rows, right = [], []
@@ -125,21 +143,12 @@ def scale_and_gravity(
 
 
 def _forces(
-    t: Float[np.ndarray, " n"], R_world_body: Float[np.ndarray, "n 3 3"], imu: Imu
+    t: Float[np.ndarray, " n"], R_world_body: Float[np.ndarray, "n 3 3"], imu: Imu, turned: Slerp
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m 3"]]:
     """Specific forces in the world, turned by the pose before them and the gyroscope since."""
     inside = (imu.t >= t[0]) & (imu.t <= t[-1])
-    integrated, times = _integrated(imu), np.asarray(imu.t)[inside]
+    times = np.asarray(imu.t)[inside]
     k = np.clip(np.searchsorted(t, times, side="right") - 1, 0, len(t) - 2)
-    at_pose = integrated(np.clip(t, imu.t[0], imu.t[-1])).as_matrix()
-    since = np.swapaxes(at_pose[k], 1, 2) @ integrated(times).as_matrix()
+    at_pose = turned(np.clip(t, imu.t[0], imu.t[-1])).as_matrix()
+    since = np.swapaxes(at_pose[k], 1, 2) @ turned(times).as_matrix()
     return times, np.einsum("nij,njk,nk->ni", R_world_body[k], since, imu.acceleration_body[inside])
-
-
-def _integrated(imu: Imu) -> Slerp:
-    """The orientation that the gyroscope's readings add up to, from the first on."""
-    omega, t = np.asarray(imu.omega_body), np.asarray(imu.t)
-    R = [np.eye(3)]
-    for step in rigid.so3_exp((omega[1:] + omega[:-1]) / 2 * np.diff(t)[:, None]):
-        R.append(R[-1] @ step)
-    return Slerp(t, Rotation.from_matrix(np.array(R)))

@@ -52,7 +52,7 @@ def segments(control_poses: Float[Array, "k 4 4"]) -> Segment:
     return Segment(control_poses[:-3], three(increment), three(by_next), three(by_previous))
 
 
-def basis(u: Float[Array, "*n"], interval: float) -> Float[Array, "*n 3 3"]:
+def basis(u: Float[Array, "*n"], interval: Float[Array, ""]) -> Float[Array, "*n 3 3"]:
     """The cumulative basis of a cubic B-spline with its first two derivatives in time.
 
     Args:

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from jaxpose.estimate import inertial, solver
 from jaxpose.estimate.system import Noise, Problem
 from jaxpose.geometry import rigid
-from jaxpose.imu import Imu, ImuNoise
+from jaxpose.imu import Imu, ImuNoise, residual_sigmas
 from jaxpose.imu.types import AnyArray
 
 _ROUNDS = 10  # at most
@@ -42,8 +42,8 @@ def first_levels(
     """
     sheet = np.zeros(2)
     if noise is not None and imu is not None:
-        per_sample = np.sqrt(1 / float(np.median(np.diff(imu.t))))
-        sheet = per_sample * np.array([noise.gyro_density, noise.accelerometer_density])
+        stated = residual_sigmas(noise, 1 / float(np.median(np.diff(imu.t))), duration=0.0)
+        sheet = np.array([stated.tight, stated.accelerometer])
     found = inertial.white_noise(readings)
     white = np.where(np.isfinite(found) & (found > 0), found, _UNKNOWN)
     start = np.maximum(white, sheet) if fit_noise or imu is None else sheet
@@ -67,7 +67,7 @@ def calibrated(
     rotations alike, none tells nothing.
     """
     for _ in range(_ROUNDS):
-        fit = solver.spread(at)[1]
+        fit = solver.spread(at)[2]
         new = jax.tree.map(_level, level, usual, fit.squares, fit.degrees)
         new = new._replace(**_of_poses(problem, level, new))
         calm = all(jnp.all(jnp.abs(a / b - 1) < _CALM) for a, b in zip(new, level, strict=True))

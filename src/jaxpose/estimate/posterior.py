@@ -9,7 +9,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from jaxpose.estimate import solver
-from jaxpose.estimate.blocks import Covariance, Factorisation, factorise, solve_rows
+from jaxpose.estimate.blocks import Covariance, Factorisation, solve_rows
 from jaxpose.estimate.inertial import NodeReadings, white_noise
 from jaxpose.estimate.system import (
     BLOCK,
@@ -25,7 +25,7 @@ from jaxpose.estimate.system import (
 from jaxpose.fields import Covariances, Params, PoseField, bspline
 from jaxpose.fields._bspline import control_rows
 from jaxpose.fields.types import Span
-from jaxpose.geometry import rigid, se3
+from jaxpose.geometry import rigid
 
 _TABLE_HZ = 20.0  # of covariances in files
 _UNOBSERVED = 0.1  # share of what was known before
@@ -112,7 +112,8 @@ class Posterior(NamedTuple):
             ValueError: times beyond the poses that were measured.
         """
         _, J, pair = self._rows(t)
-        P = np.asarray(solver.pair_covariance(jax.tree.map(np.asarray, self.known)))
+        with jax.enable_x64(True):
+            P = np.asarray(solver.pair_covariance(self.known))
         return J @ P[pair] @ np.swapaxes(J, 1, 2)
 
     def relative_covariance(
@@ -129,10 +130,9 @@ class Posterior(NamedTuple):
         """
         T_a, J_a, pair_a = self._rows(t_a)
         T_b, J_b, pair_b = self._rows(t_b)
+        carried = -rigid.adjoint(rigid.inverse(T_b) @ T_a) @ J_a
         with jax.enable_x64(True):
-            carried = -np.asarray(se3.adjoint(jnp.asarray(rigid.inverse(T_b) @ T_a))) @ J_a
-            found = _joint(self.factor, carried, pair_a, J_b, pair_b)
-            return np.asarray(found)
+            return np.asarray(_joint(self.factor, carried, pair_a, J_b, pair_b))
 
     def covariances(self) -> Covariances:
         """Covariances of poses and of moves of one second, 20 times a second, as `fields.save` takes them."""
@@ -178,12 +178,10 @@ def posterior_of(
     estimated: tuple[str, ...],
 ) -> Posterior:
     """The posterior of a problem that has been solved; float64."""
-    known, _ = solver.spread(at)
+    factor, known, _ = solver.spread(at)
     sigma = np.sqrt(np.diag(known.corner)) * np.asarray(problem.prior.free)
-    bias, bias_sigma = (
-        np.asarray(at.state.bias),
-        np.sqrt(np.diagonal(known.diagonal, axis1=1, axis2=2))[:, 18:],
-    )
+    bias = np.asarray(at.state.bias)
+    bias_sigma = np.sqrt(np.diagonal(known.diagonal, axis1=1, axis2=2))[:, 18:]
     sensors = Sensors(
         float(at.state.offset_s),
         float(sigma[OFFSET][0]),
@@ -204,7 +202,6 @@ def posterior_of(
     noise = NoiseLevels(
         float(white[0]), float(white[1]), *bands, float(level.position), float(level.rotation)
     )
-    factor = jax.jit(factorise)(at.blocks)
     return Posterior(sensors, noise, estimated, clock_s, problem, at.state, known, factor)
 
 

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 from jaxpose._checks import check_increasing
 from jaxpose.errors import DataError
@@ -16,7 +15,7 @@ from jaxpose.estimate import alignment, inertial, solver
 from jaxpose.estimate.noise_levels import calibrated, first_levels
 from jaxpose.estimate.posterior import Posterior, posterior_of
 from jaxpose.estimate.system import Prior, Problem, State
-from jaxpose.fields._bspline import start_along
+from jaxpose.fields._bspline import control_poses_along
 from jaxpose.fields._fit_input import checked_poses
 from jaxpose.geometry import rigid
 from jaxpose.imu import GRAVITY_WORLD, Imu, ImuNoise
@@ -132,14 +131,15 @@ def _guess(measured: _Measured, T_body_cam, gravity_world, offset_s: float) -> _
     if imu is None:
         return _Guess(np.eye(4) if T_body_cam is None else T_body_cam, gravity, 0.0, 1.0)
     R = None if T_body_cam is None else np.asarray(T_body_cam, np.float64)[:3, :3]
+    turned = alignment.gyro_orientation(imu)
     if R is None or "offset" in asked:
         reach = _REACH_S if "offset" in asked else 0.0
-        shift, R = alignment.rotation_alignment(t + offset_s, T[:, :3, :3], imu, reach, R)
+        shift, R = alignment.rotation_alignment(t + offset_s, T[:, :3, :3], turned, reach, R)
         offset_s += shift
     scale, unknown_gravity = 1.0, gravity_world is None and "gravity" in asked
     if "scale" in asked or unknown_gravity:
         size, known = float(np.linalg.norm(gravity)), None if "scale" in asked else 1.0
-        scale, found = alignment.scale_and_gravity(t + offset_s, T, imu, R, size, scale=known)
+        scale, found = alignment.scale_and_gravity(t + offset_s, T, imu, turned, R, size, scale=known)
         gravity = found if unknown_gravity else gravity
     T_body_cam = rigid.make(R, np.zeros(3)) if T_body_cam is None else np.asarray(T_body_cam, np.float64)
     return _Guess(T_body_cam, gravity, offset_s, scale)
@@ -159,7 +159,7 @@ def _solved(measured: _Measured, guess: _Guess, fit_noise: bool, knots_hz: float
     metric = measured.T.copy()
     metric[:, :3, 3] *= guess.scale
     along_body = metric @ rigid.inverse(guess.T_body_cam)
-    control = _control_poses((first, last), intervals, t, along_body)
+    control = control_poses_along((first, last), intervals, t, along_body)
     levels = first_levels(readings, measured.noise, imu, t, metric, fit_noise)
     with jax.enable_x64(True):
         f = lambda x: jnp.asarray(x, jnp.float64)
@@ -183,13 +183,6 @@ def _solved(measured: _Measured, guess: _Guess, fit_noise: bool, knots_hz: float
         if fit_noise:
             at, level = calibrated(problem, at, level, usual)
         return posterior_of(problem, at, level, readings, clock_s=first, estimated=measured.estimate)
-
-
-def _control_poses(span, intervals: int, t, T) -> Float[np.ndarray, "k 4 4"]:
-    """Control poses along the body's poses."""
-    points = start_along(span, intervals, t, T)
-    quaternion = points[:, 3:] + [1, 0, 0, 0]
-    return rigid.make(Rotation.from_quat(quaternion, scalar_first=True).as_matrix(), points[:, :3])
 
 
 def _prior(estimate: Sequence[str], noise: ImuNoise | None) -> Prior:

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxpose.estimate.blocks import Blocks, Covariance, covariance, factorise, solve
+from jaxpose.errors import DataError
+from jaxpose.estimate.blocks import Blocks, Covariance, Factorisation, covariance, factorise, solve
 from jaxpose.estimate.system import Noise, Problem, Residuals, State, normal_equations, residuals, retract
 
 _STEPS = 50  # at most
@@ -42,11 +43,11 @@ def optimise(problem: Problem, state: State, noise: Noise, steps: int = _STEPS) 
     """The state of least cost near the given one, linearised there; float64 throughout.
 
     Raises:
-        FloatingPointError: the problem has no finite cost at the given state.
+        DataError: the problem has no finite cost at the given state.
     """
     at = linearise(problem, state, noise)
     if not np.isfinite(at.cost):
-        raise FloatingPointError(f"estimate: expected a finite cost at the start, got {float(at.cost)}")
+        raise DataError(f"estimate: expected a finite cost to begin with, got {float(at.cost)}")
     damping = _DAMPING
     for _ in range(steps):
         moved = linearise(problem, _moved(at, damping), noise)
@@ -72,9 +73,10 @@ def _moved(at: Linearisation, damping: Float[Array, ""]) -> State:
 
 
 @jax.jit
-def spread(at: Linearisation) -> tuple[Covariance, GroupFit]:
-    """The covariance of the unknowns, and how well each group of residuals is explained."""
-    known = covariance(factorise(at.blocks))
+def spread(at: Linearisation) -> tuple[Factorisation, Covariance, GroupFit]:
+    """What the unknowns' covariance follows from, parts of it, and how well each group is explained."""
+    factor = factorise(at.blocks)
+    known = covariance(factor)
     P = pair_covariance(known)
     explained = lambda J, P: jnp.einsum("...ij,...jk,...ik->...i", J, P, J)
     sums = []
@@ -86,7 +88,7 @@ def spread(at: Linearisation) -> tuple[Covariance, GroupFit]:
         sums.append(both.reshape(2, -1, *both.shape[-2:-1], 2, 3).sum((1, -1)))
     inertial, motion, poses = sums[0], sums[1].sum(1), sums[2].sum(1)
     of = lambda k: Noise(inertial[k, :, 0], inertial[k, :, 1], *poses[k], *motion[k])
-    return known, GroupFit(of(0), of(1))
+    return factor, known, GroupFit(of(0), of(1))
 
 
 def pair_covariance(known: Covariance) -> Float[Array, "n 58 58"]:

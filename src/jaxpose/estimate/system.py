@@ -203,8 +203,7 @@ def along(
     problem: Problem, segment: Segment, index: Int[Array, " p"], place: Float[Array, " p"]
 ) -> Kinematics:
     """The motion at places of intervals."""
-    per_interval = problem.interval_s ** jnp.arange(3, dtype=place.dtype)[:, None]
-    weights = basis(place, 1.0) / per_interval[None]
+    weights = basis(place, problem.interval_s)
     return jax.vmap(kinematics)(jax.tree.map(lambda x: x[index], segment), weights)
 
 

@@ -100,16 +100,8 @@ def aligned_error(
     information = np.linalg.inv(covariance)
     for _ in range(5):
         error = rigid.log(rigid.inverse(estimate) @ truth)
-        J = _adjoint(rigid.inverse(estimate))  # of a common increment on the left
+        J = rigid.adjoint(rigid.inverse(estimate))  # of a common increment on the left
         H = np.einsum("nki,nkl,nlj->ij", J, information, J)
         step = np.linalg.solve(H, np.einsum("nki,nkl,nl->i", J, information, error))
         estimate = rigid.exp(step[None])[0] @ estimate
     return rigid.log(rigid.inverse(estimate) @ truth)
-
-
-def _adjoint(T: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 6 6"]:
-    R, p = T[:, :3, :3], T[:, :3, 3]
-    hat = np.cross(np.eye(3), p[:, None, :]).swapaxes(1, 2) * -1
-    result = np.zeros((len(T), 6, 6))
-    result[:, :3, :3], result[:, 3:, 3:], result[:, :3, 3:] = R, R, hat @ R
-    return result

@@ -117,10 +117,17 @@ def control_points_along(
 def start_along(
     span: Span, intervals: int, times: Float[np.ndarray, " m"], poses: Float[np.ndarray, "m 4 4"]
 ) -> Float[np.ndarray, "n 7"]:
-    """`control_points_along` for any span, in float64: at each knot the pose between its neighbours."""
+    """`control_points_along` for any span, in float64."""
+    return control_rows(control_poses_along(span, intervals, times, poses))
+
+
+def control_poses_along(
+    span: Span, intervals: int, times: Float[np.ndarray, " m"], poses: Float[np.ndarray, "m 4 4"]
+) -> Float[np.ndarray, "n 4 4"]:
+    """Control poses on stamped poses: at each knot that between its neighbours."""
     first, last = span
     knots = first + (np.arange(intervals + 3) - 1) * ((last - first) / intervals)
-    return control_rows(numpy_evaluator.evaluate({"kind": "stamped", "times": times, "poses": poses}, knots))
+    return numpy_evaluator.evaluate({"kind": "stamped", "times": times, "poses": poses}, knots)
 
 
 def control_rows(T: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 7"]:

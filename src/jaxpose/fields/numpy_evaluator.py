@@ -55,10 +55,10 @@ def load_covariance(path, name="covariance"):
 
     def covariance(t):
         t = np.atleast_1d(np.asarray(t, float))
-        if not ((t >= times[0]) & (t <= times[-1])).all():
+        if not ((t >= times[0] - 1e-6) & (t <= times[-1] + 1e-6)).all():  # a file's digits
             raise ValueError(f"t: expected times between {times[0]:.6g} and {times[-1]:.6g} s, got {t}")
         i = np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(times) - 2)
-        share = ((t - times[i]) / (times[i + 1] - times[i]))[:, None, None]
+        share = np.clip((t - times[i]) / (times[i + 1] - times[i]), 0, 1)[:, None, None]
         return (1 - share) * known[i] + share * known[i + 1]
 
     return covariance

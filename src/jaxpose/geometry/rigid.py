@@ -224,6 +224,27 @@ def vector_angle(a: Float[np.ndarray, "*#n 3"], b: Float[np.ndarray, "*#n 3"]) -
     return np.asarray(np.arctan2(sine, cosine))
 
 
+def adjoint(T_a_b: Float[np.ndarray, "*n 4 4"]) -> Float[np.ndarray, "*n 6 6"]:
+    """The matrix that moves a twist from frame b to a: `T exp(xi) T^-1 = exp(adjoint(T) xi)`.
+
+    Args:
+        T_a_b: Transforms (..., 4, 4).
+
+    Returns:
+        Matrices (..., 6, 6) on twists [translation, rotation] (Sola et al. 2018, eq. 31).
+    """
+    R = T_a_b[..., :3, :3]
+    result = np.zeros((*T_a_b.shape[:-2], 6, 6))
+    result[..., :3, :3], result[..., 3:, 3:] = R, R
+    result[..., :3, 3:] = _hat(T_a_b[..., :3, 3]) @ R
+    return result
+
+
+def _hat(v: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
+    """The matrix of the cross product with v from the left."""
+    return np.cross(np.eye(3), v[..., None, :])
+
+
 def _left_jacobian(phi: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
     """How far unit velocities come in unit time while turning by phi: I + b hat(phi) + c hat(phi)^2."""
     square = np.sum(phi * phi, axis=-1)[..., None, None]
@@ -231,5 +252,5 @@ def _left_jacobian(phi: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"
     near = square < 1
     series = np.polynomial.polynomial.polyval(np.where(near, square, 0), _SINE)
     c = np.where(near, series, (angle - np.sin(angle)) / np.where(near, 1, angle * square))
-    hat = np.cross(np.eye(3), phi[..., None, :])
+    hat = _hat(phi)
     return np.eye(3) + 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 * hat + c * hat @ hat

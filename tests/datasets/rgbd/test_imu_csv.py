@@ -113,7 +113,7 @@ def test_a_mounting_is_16_numbers_or_a_data_sheet(desk):
     numbers = ", ".join(map(repr, MOUNTING.ravel().tolist()))
     sheet.write_text(f"%YAML:1.0\nT_BS:\n  cols: 4\n  rows: 4\n  data: [{numbers}]\nrate_hz: 20\n")
     for file in (sheet, desk / "mounting.txt"):
-        np.testing.assert_allclose(read_mounting(file), MOUNTING, atol=1e-12)
+        np.testing.assert_allclose(read_mounting(file).T_body_cam, MOUNTING, atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
+from jaxpose.cli.fit.candidates import noise_floor
 from jaxpose.datasets.rgbd import euroc
 from jaxpose.datasets.rgbd.imu_csv import read_imu, read_mounting
 from jaxpose.errors import DataError
@@ -64,6 +66,7 @@ def calibrate(config, source: str, trajectory: Trajectory, on_update: OnUpdate) 
     t0 = float(trajectory.t[0])
     imu, sheet = _readings(config.imu, t0)
     sigmas = np.repeat([config.position_sigma, np.radians(config.rotation_sigma_deg)], 3)
+    mounting = None if config.extrinsics is None else read_mounting(config.extrinsics)
     on_update(Update(f"estimating {', '.join(config.estimate)} (compiling)"))
     try:
         known = smooth(
@@ -73,7 +76,8 @@ def calibrate(config, source: str, trajectory: Trajectory, on_update: OnUpdate) 
             imu,
             estimate=config.estimate,
             noise=sheet,
-            T_body_cam=None if config.extrinsics is None else read_mounting(config.extrinsics),
+            T_body_cam=None if mounting is None else mounting.T_body_cam,
+            offset_s=0.0 if mounting is None else mounting.offset_s,
         )
     except ValueError as error:
         raise DataError(f"{source}: {error}") from None
@@ -153,11 +157,8 @@ def _write(out: Path, known: Posterior, t0: float) -> None:
     covariance = known.covariances()
     up = np.eye(3)
     if "gravity" in known.estimated:
-        g = known.sensors.gravity_world / np.linalg.norm(known.sensors.gravity_world)
-        axis = np.cross(g, [0.0, 0.0, -1.0])
-        size = np.linalg.norm(axis)
-        angle = np.arctan2(size, -g[2])
-        up = rigid.so3_exp(axis / size * angle if size > 1e-12 else np.array([angle, 0.0, 0.0]))
+        down = np.array([0.0, 0.0, -1.0])
+        up = Rotation.align_vectors(down, known.sensors.gravity_world)[0].as_matrix()  # the shortest way
     out.parent.mkdir(parents=True, exist_ok=True)
     save(
         out,
@@ -178,8 +179,7 @@ def _found(config, source, trajectory, imu, sheet, known: Posterior, notes) -> C
     )
     stated = None
     if sheet is not None:
-        rate = np.sqrt(1 / float(np.median(np.diff(imu.t))))
-        stated = (float(sheet.gyro_density * rate), float(sheet.accelerometer_density * rate))
+        stated = noise_floor(sheet, 1 / float(np.median(np.diff(imu.t))))
     return Calibration(
         source,
         len(trajectory.t),

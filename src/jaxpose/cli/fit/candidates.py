@@ -1,6 +1,5 @@
 """Pose fields fitted to stamped poses, and what is left: at poses held out, and against inertial readings."""
 
-import math
 import time
 from collections.abc import Callable
 from functools import partial
@@ -22,7 +21,7 @@ from jaxpose.fields import Params, PoseField, PoseNetConfig
 from jaxpose.fields.derivatives import motion
 from jaxpose.files.trajectories import Trajectory
 from jaxpose.geometry import rigid
-from jaxpose.imu import Imu, ImuNoise
+from jaxpose.imu import Imu, ImuNoise, residual_sigmas
 
 _SHARE = 0.95  # of the power of the speeds, below what is called the motion's bandwidth
 _NOISY = 0.8  # share of the highest frequency from where on poses are taken to hold nothing but noise
@@ -176,7 +175,8 @@ def sample_noise(readings: Float[np.ndarray, "n 3"]) -> float:
 
 def noise_floor(noise: ImuNoise, rate_hz: float) -> tuple[float, float]:
     """One sigma of a reading by the data sheet: rad/s and m/s^2."""
-    return noise.gyro_density * math.sqrt(rate_hz), noise.accelerometer_density * math.sqrt(rate_hz)
+    stated = residual_sigmas(noise, rate_hz, duration=0.0)
+    return stated.tight, stated.accelerometer
 
 
 def _into(around: Frame, trajectory: Trajectory) -> Trajectory:

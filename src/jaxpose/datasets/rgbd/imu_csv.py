@@ -3,12 +3,11 @@
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 
 from jaxpose.datasets.rgbd.euroc_files import IMU_COLUMNS, read_csv, read_extrinsics
 from jaxpose.datasets.types import Recording
 from jaxpose.errors import DataError
-from jaxpose.files.kalibr import is_camchain, read_camchain
+from jaxpose.files.kalibr import CameraImu, is_camchain, read_camchain
 from jaxpose.files.tables import numbered_lines, read_all_numbers, read_stamped, seconds
 from jaxpose.files.trajectories import orthonormal
 from jaxpose.geometry import rigid
@@ -42,28 +41,28 @@ def read_imu(file: Path | str, t0_ns: int = 0) -> Imu:
     return Imu(seconds(ns, t0_ns), values[:, :3], values[:, 3:])
 
 
-def read_mounting(file: Path | str) -> Float[np.ndarray, "4 4"]:
+def read_mounting(file: Path | str) -> CameraImu:
     """Read where the camera is on the IMU: EuRoC's `cam0/sensor.yaml`, Kalibr's camchain, or 16 numbers.
 
     Args:
         file: A data sheet with `T_BS`, a camchain with `T_cam_imu`, or the numbers of a 4x4 matrix.
 
     Returns:
-        `T_body_cam`, its rotation orthonormal.
+        `T_body_cam`, its rotation orthonormal, and the time offset of a camchain, else 0.
 
     Raises:
         DataError: Naming the file for another count, for NaN, and for what is no rigid transform.
     """
     file = Path(file)
     if is_camchain(file):
-        return read_camchain(file).T_body_cam
+        return read_camchain(file)
     if any(line.startswith("T_BS") for _, line in numbered_lines(file)):
         T = read_extrinsics(file)
     else:
         T = read_all_numbers(file, (16,), "T_BS, or the 16 numbers of a 4x4 T_body_cam").reshape(4, 4)
     if np.abs(T[3] - [0, 0, 0, 1]).max() > 1e-6:
         raise DataError(f"{file}: expected a last row 0 0 0 1, got {' '.join(f'{x:g}' for x in T[3])}")
-    return orthonormal(T[None], lambda _: str(file))[0]
+    return CameraImu(orthonormal(T[None], lambda _: str(file))[0], 0.0)
 
 
 def with_imu(recording: Recording, readings: Path | str, mounting: Path | str) -> Recording:
@@ -81,10 +80,8 @@ def with_imu(recording: Recording, readings: Path | str, mounting: Path | str) -
     Raises:
         DataError: As the two.
     """
-    imu, offset_s = read_imu(readings, recording.t0_ns), 0.0
-    if is_camchain(mounting):
-        offset_s = read_camchain(mounting).offset_s
-    return recording._replace(imu=imu._replace(t=imu.t - offset_s), T_body_cam=read_mounting(mounting))
+    imu, (T_body_cam, offset_s) = read_imu(readings, recording.t0_ns), read_mounting(mounting)
+    return recording._replace(imu=imu._replace(t=imu.t - offset_s), T_body_cam=T_body_cam)
 
 
 def imu_notes(recording: Recording, name: Path | str) -> tuple[str, ...]:
