@@ -86,7 +86,7 @@ def estimate_trajectory(state: SlamState, imu: Imu | None) -> Posterior | None:
     config, frames = state.config, state.frames
     if imu is None or not config.uses_gyroscope or config.uses_field:
         return None
-    sigma = _sigmas(frames)
+    sigma = registered_sigmas(frames)
     kept = np.isfinite(sigma).all(axis=1)
     if kept.sum() < _FEWEST:
         return None
@@ -105,7 +105,7 @@ def estimate_trajectory(state: SlamState, imu: Imu | None) -> Posterior | None:
     )
 
 
-def _sigmas(frames: Frames) -> np.ndarray:
+def registered_sigmas(frames: Frames) -> Float[np.ndarray, "n 2"]:
     """One sigma (n, 2) of position [m] and rotation [rad] of the registered frames, NaN of the others."""
     registered = (frames.status <= TrackingStatus.WEAK) & np.isfinite(frames.sigma).all(axis=1)
     sigma = np.where(registered[:, None], frames.sigma, np.nan)
