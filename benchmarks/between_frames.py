@@ -1,8 +1,8 @@
 """Half-way between frames: every second pose of a run is left out, and estimated from the others.
 
 Options are those of `python -m jaxpose.experiments.imu_slam`. Printed are errors after SE(3) alignment of the
-tracked poses and of the batch pass, and, at the poses left out, of a spline through the others and of `smooth`
-by the others and the readings of one sensor or both.
+tracked poses and of the batch pass, and, at the poses left out, of a spline through the others and of
+`smooth` by the others and the readings of one sensor or both.
 
     python benchmarks/between_frames.py --help
 """
