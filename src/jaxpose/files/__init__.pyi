@@ -4,6 +4,7 @@ from . import colmap as colmap
 from . import ply as ply
 from . import run_folder as run_folder
 from . import trajectories as trajectories
+from .colmap import read_colmap as read_colmap
 from .colmap import write_colmap as write_colmap
 from .ply import read_points as read_points
 from .ply import write_ply as write_ply
