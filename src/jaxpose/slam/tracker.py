@@ -43,7 +43,7 @@ def next_pose(
 ) -> SlamState:
     """The state with the pose of its last frame, which has none yet: registered, or predicted and marked."""
     config, policy, frames = state.config, state.config.recovery, state.frames
-    predicted = _predict(state)
+    predicted = by_motion = _predict(state)
     seen = None if features is None else seen_pose(state, predicted, frame, features)
     if seen is not None:
         state, predicted = with_features(state, predicted, seen)
@@ -51,7 +51,7 @@ def next_pose(
     held = seen is not None and bool(max(worst_sigmas(seen.covariance)) < policy.held_by_features)
     reach = _reach(state, predicted, held)
     if np.mean(frame.depth > 0) < policy.least_depth:
-        return _update_state(state, frames, predicted, None, TrackingStatus.LOST)
+        return _update_state(state, frames, predicted, by_motion, None, TrackingStatus.LOST)
     near_key, wide_key = jax.random.split(key)
     used = predicted
     tracked = _track(state, frames, predicted, image, generator, near_key)
@@ -66,9 +66,9 @@ def next_pose(
             frames, tracked, lost, used = corrected, other, other_lost, around
     unknown_place = lost and tracked.valid < config.track.minimum_valid
     if unknown_place and config.uses_accelerometer and max(reach) < policy.reckoned:
-        return _update_state(state, state.frames, predicted, None, TrackingStatus.DEAD_RECKONED)
+        return _update_state(state, state.frames, predicted, by_motion, None, TrackingStatus.DEAD_RECKONED)
     if lost:
-        return _update_state(state, state.frames, predicted, tracked, TrackingStatus.LOST)
+        return _update_state(state, state.frames, predicted, by_motion, tracked, TrackingStatus.LOST)
     if seen is not None:
         frames = frames.put(-1, feature_nis=feature_nis(state, frames, used, seen, tracked))
     status = TrackingStatus.TRACKED
@@ -80,7 +80,7 @@ def next_pose(
         and _is_appearance_outlier(policy, frames, float(tracked.colour_error))
     ):
         status = TrackingStatus.APPEARANCE_OUTLIER
-    return _update_state(state, frames, predicted, tracked, status)
+    return _update_state(state, frames, predicted, by_motion, tracked, status)
 
 
 def _predict(state: SlamState) -> MotionPrediction:
@@ -114,6 +114,7 @@ def _update_state(
     state: SlamState,
     frames: Frames,
     prediction: MotionPrediction,
+    by_motion: MotionPrediction,
     tracked: Tracked | None,
     status: TrackingStatus,
 ) -> SlamState:
@@ -131,7 +132,7 @@ def _update_state(
     sure = registered is not None and status <= TrackingStatus.WEAK and frames.last_found == i - 1
     fade = np.exp(-dt / config.recovery.fading_s) if status == TrackingStatus.LOST else 1.0
     velocity_body = end_velocity(dt, T_ref_body, prediction.readings, speed=config.uses_accelerometer)
-    motion = _observe_biases(state, T_ref_body, predicted, dt) if sure else state.motion
+    motion = _observe_biases(state, T_ref_body, by_motion.T_ref_body[-1], dt) if sure else state.motion
     motion = motion._replace(
         twist=fade * rigid.log(T_ref_body) / dt,
         velocity_body=velocity_body if config.uses_accelerometer else fade * velocity_body,
