@@ -262,7 +262,7 @@ def test_wrong_calls_cost_one_line(files, tmp_path):
         (["eval", file, file, "--match", "exact"], "expected a run folder with field.npz, got a TUM file"),
         (["eval", file, file, "--plot", tmp_path / "no" / "p.png"], "No such file or directory"),
         (["eval", file, file, "--plot", "p.jpg"], "--plot: expected a name that ends in .png, got p.jpg"),
-        (["eval", tmp_path / "broken", file], "broken/results.json: expected the results of a run"),
+        (["eval", tmp_path / "broken", file], "broken/results.json:1: expected the results of a run"),
     ):  # fmt: skip
         line = complaint(*args)
         assert line.startswith("jaxpose") and re.search(message, line, re.IGNORECASE), line

@@ -1,6 +1,7 @@
 """`jaxpose export`: poses through every format and back, no motion that nobody measured, wrong calls."""
 
 import json
+import re
 
 import jax.numpy as jnp
 import numpy as np
@@ -190,14 +191,32 @@ def test_runs_of_before(run, tmp_path):
 def test_camera_files(tmp_path):
     write_camera(tmp_path / "camera.json", CAMERA, ("a.png", "b.png"), "images")
     assert read_camera(tmp_path / "camera.json") == (CAMERA, ("a.png", "b.png"), tmp_path / "images")
-    for text in (
-        "{",
-        "[]",
-        '{"images": []}',
-        '{"images": [], "images_folder": ".", "distortion": [], "f": 1}',
+    whole = json.loads((tmp_path / "camera.json").read_text())
+    for change, message in (
+        ({"fx": 0}, "camera.json: fx: expected a finite number above 0 up to 1e+09, got 0"),
+        ({"cy": None}, "camera.json: cy: expected a finite number from -1e+09 to 1e+09, got None"),
+        ({"fy": True}, "camera.json: fy: expected a finite number above 0 up to 1e+09, got True"),
+        ({"width": -32}, "camera.json: width: expected a whole number from 1 to 100000, got -32"),
+        ({"height": 20.5}, "camera.json: height: expected a whole number from 1 to 100000, got 20.5"),
+        ({"distortion": [0.1]}, "camera.json: distortion: expected 0, 4 or 5 numbers, got 1"),
+        (
+            {"images": ["../a.png"]},
+            "camera.json: expected a file name that stays in its folder, got '../a.png'",
+        ),
+        ({"images": [1]}, "camera.json: images: expected a list of file names, got [1]"),
+        ({"images_folder": 3}, "camera.json: images_folder: expected a text, got 3"),
+    ):
+        (tmp_path / "camera.json").write_text(json.dumps(whole | change))
+        with pytest.raises(DataError, match=re.escape(message)):
+            read_camera(tmp_path / "camera.json")
+    for text, message in (
+        ("{", "camera.json:1: expected the camera of a run, got Expecting property"),
+        ("[]", "camera.json: expected the camera of a run, got no JSON object but"),
+        ("[" * 100_000, "camera.json: expected the camera of a run, got nesting without end"),
+        ('{"fx": ' + 9999 * "1" + "}", "camera.json: expected the camera of a run, got Exceeds the limit"),
     ):
         (tmp_path / "camera.json").write_text(text)
-        with pytest.raises(DataError, match="camera.json: expected the camera of a run, got"):
+        with pytest.raises(DataError, match=re.escape(message)):
             read_camera(tmp_path / "camera.json")
 
 

@@ -27,7 +27,7 @@ from jaxpose.cli.view.command import Config
 from jaxpose.cli.view.scene import read_scene, up_direction
 from jaxpose.cli.view.types import WIDTH
 from jaxpose.errors import DataError
-from jaxpose.experiments.slam.map_file import SavedMap, write_map
+from jaxpose.experiments.slam.map_file import SavedMap, read_map, write_map
 from jaxpose.files import atomic, trajectories
 from jaxpose.files.camera_json import write_camera
 from jaxpose.files.ply import write_ply
@@ -274,6 +274,23 @@ def test_a_map_of_another_kind(run):
     np.savez(run / "map.npz", **(content | {"keyframes": np.array([0, 9])}))
     with pytest.raises(DataError, match="map.npz: expected keyframes below 9, got 9"):
         read_scene(run, 0)
+    count = len(content["coords"])
+    for change, words in (
+        ({"voxel": -0.1}, "voxel: expected a finite number above 0 up to 10000, got -0.1"),
+        (
+            {"values": np.full_like(content["values"], np.nan)},
+            "values: expected .* finite numbers .*, got nan",
+        ),
+        ({"values": content["values"][:-1]}, "values: expected .*, got shape"),
+        ({"coords": np.zeros((count, 3), int)}, "coords: expected blocks beside each other"),
+        ({"coords": content["coords"] * 10**6}, "coords: expected blocks beside each other"),
+        ({"texture_slot": np.full(count, 5)}, "texture_slot: expected .* from 0 to 0, got 5"),
+        ({"texture_tiles": np.zeros((1, 17, 17, 17, 4))}, "texture_tiles: expected uint8 .* got float64"),
+        ({"keyframes": np.array([-1])}, "keyframes: expected n whole numbers of at least 0, got -1"),
+    ):
+        np.savez(run / "map.npz", **(content | {name: np.asarray(value) for name, value in change.items()}))
+        with pytest.raises(DataError, match=f"map.npz: {words}"):
+            read_map(run / "map.npz")
 
 
 def test_without_the_extra(run, monkeypatch):

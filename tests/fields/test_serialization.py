@@ -13,6 +13,7 @@ from jaxpose import fields
 from jaxpose.errors import DataError
 from jaxpose.evaluation import trajectory_error
 from jaxpose.fields import PoseNetConfig, numpy_evaluator, serialization
+from jaxpose.fields._entries import read_entries
 from jaxpose.geometry import rigid, se3
 
 SPAN = (0.5, 4.0)
@@ -177,6 +178,80 @@ def test_other_files_are_refused(tmp_path):
     (tmp_path / "text.npz").write_text("no archive")
     with pytest.raises(DataError, match="text.npz: expected a trajectory, got"):
         serialization.load(tmp_path / "text.npz")
+
+
+def entries_of(kind: str) -> dict[str, np.ndarray]:
+    """A small file of each kind of factor, made by hand as the module describes it."""
+    entries = {"version": 1, "span": [0.0, 2.0], "count": 1, "0.kind": kind}
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    of_kind = {
+        "stamped": {"times": [0.0, 1.0, 2.0], "poses": poses},
+        "table": {"times": [0.0, 1.0, 2.0], "poses": poses},
+        "bspline": {"span": [0.0, 2.0], "control_points": np.zeros((5, 7))},
+        "posenet": {
+            "span": [0.0, 2.0], "weights": [1.0], "activation": "relu", "head": "free",
+            "translation_scale": 1.0,
+            "translation.0.kernel": np.ones((3, 2)), "translation.0.bias": np.ones(2),
+            "translation.1.kernel": np.ones((5, 3)), "translation.1.bias": np.ones(3),
+            "rotation.0.kernel": np.ones((3, 4)), "rotation.0.bias": np.ones(4),
+        },
+    }[kind]  # fmt: skip
+    entries |= {f"0.{name}": value for name, value in of_kind.items()}
+    entries |= {"covariance_times": [0.0, 1.0], "covariance": np.tile(np.eye(6), (2, 1, 1))}
+    return {name: np.asarray(value) for name, value in entries.items()}
+
+
+@pytest.mark.parametrize("kind", ["stamped", "table", "bspline", "posenet"])
+def test_a_file_made_by_hand_is_read(tmp_path, kind):
+    np.savez(tmp_path / "field.npz", **entries_of(kind))
+    np.testing.assert_array_equal(read_entries(tmp_path / "field.npz")["0.kind"], kind)
+    assert serialization.load(tmp_path / "field.npz")[0].span == (0.0, 2.0)
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "value", "words"),
+    [
+        ("stamped", "span", [2.0, 0.0], "span: expected two increasing times, got 2 and 0"),
+        ("stamped", "span", [0.0, np.inf], "span: expected 2 finite numbers, got inf"),
+        ("stamped", "count", -1, "count: expected a whole number from 1 to 8, got -1"),
+        ("stamped", "count", [1, 2], "count: expected a whole number from 1 to 8, got int64"),
+        (
+            "stamped",
+            "count",
+            2,
+            "1.kind: expected one of posenet, bspline, table, stamped, got no such entry",
+        ),
+        ("stamped", "0.kind", "spline", "0.kind: expected one of .*, got 'spline'"),
+        ("stamped", "0.times", [0.0, 2.0, 1.0], "0.times: expected a time after 2.0, got 1.0"),
+        ("stamped", "0.times", [0.0, 1.0], "0.poses: expected 2x4x4 finite numbers, got shape"),
+        ("stamped", "0.times", np.zeros(0), "0.times: expected one or more, got none"),
+        ("table", "0.poses", np.full((3, 4, 4), np.nan), "0.poses: expected 3x4x4 finite numbers, got nan"),
+        ("table", "0.poses", np.tile(2 * np.eye(4), (3, 1, 1)), "0.poses: expected rigid transforms"),
+        ("bspline", "0.control_points", np.zeros((3, 7)), "0.control_points: expected 4 or more, got 3"),
+        ("bspline", "0.control_points", np.full((4, 7), 1e10), "0.control_points: expected nx7 finite"),
+        ("bspline", "0.control_points", [[0.0] * 3 + [-1.0] + [0.0] * 3] * 4, "got a norm of 0 in row 0"),
+        ("bspline", "0.span", [1.0, 1.0], "0.span: expected two increasing times, got 1 and 1"),
+        ("posenet", "0.activation", "tanh", "0.activation: expected one of relu, softplus, sigmoid"),
+        ("posenet", "0.weights", np.ones(99), "0.weights: expected up to 64, got 99"),
+        ("posenet", "0.translation_scale", 0.0, "0.translation_scale: expected a finite number above 0"),
+        (
+            "posenet",
+            "0.translation.1.kernel",
+            np.ones((4, 3)),
+            "translation.1.kernel: expected 2 rows, got 4",
+        ),
+        ("posenet", "0.rotation.0.bias", np.ones(3), "0.rotation.0.bias: expected 4 finite numbers"),
+        ("posenet", "0.rotation.0.kernel", np.full((3, 4), 1e9), "0.rotation.0.kernel: expected nxn finite"),
+        ("stamped", "covariance_times", [1.0, 0.0], "covariance_times: expected a time after 1.0, got 0.0"),
+        ("stamped", "covariance", np.tile(-np.eye(6), (2, 1, 1)), "covariance: expected covariances, got"),
+        ("stamped", "covariance", np.ones((1, 6, 6)), "covariance: expected one for each of 2 times, got 1"),
+    ],
+)
+def test_what_gives_no_poses_is_refused(tmp_path, kind, name, value, words):
+    np.savez(tmp_path / "field.npz", **(entries_of(kind) | {name: np.asarray(value)}))
+    for read in (read_entries, serialization.load):
+        with pytest.raises(DataError, match=f"field.npz: .*{words}"):
+            read(tmp_path / "field.npz")
 
 
 def test_covariances_are_kept_and_interpolated(tmp_path):

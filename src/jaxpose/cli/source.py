@@ -1,7 +1,5 @@
 """What a command is given: a trajectory file of any format, or the folder of a run."""
 
-import json
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -11,6 +9,8 @@ from jaxtyping import Float
 
 from jaxpose.errors import DataError
 from jaxpose.files import trajectories
+from jaxpose.files.schema import choice
+from jaxpose.files.untrusted import read_json
 
 FIELD = "field.npz"
 
@@ -58,13 +58,21 @@ def read_field(source: Source) -> Callable[[Float[np.ndarray, " n"]], Float[np.n
     file = source.path / FIELD
     if not file.is_file():
         raise DataError(f"{file}: expected the continuous trajectory of the run, got nothing")
-    from jaxpose.fields import numpy_evaluator  # here, as its room loads jax, which --help does without
+    from jaxpose.fields import _entries, numpy_evaluator  # here, as their room loads jax
 
     try:
-        return numpy_evaluator.load(file)
-    except (ValueError, EOFError, zipfile.BadZipFile) as error:
-        found = " ".join(str(error).split()).removeprefix(f"{file}: ")
-        raise DataError(f"{file}: {found} (what older runs left needs a new run)") from None
+        poses = numpy_evaluator.load(_entries.read_entries(file))
+    except DataError as error:
+        raise DataError(f"{error} (what older runs left needs a new run)") from None
+
+    def finite(t: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 4 4"]:
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            T = poses(t)
+        if not np.isfinite(T).all():
+            raise DataError(f"{file}: expected finite poses, got NaN or infinity")
+        return T
+
+    return finite
 
 
 def images_on_disk(folder: Path, names: tuple[str, ...]) -> list[Path]:
@@ -80,7 +88,4 @@ def _experiment(results: Path) -> str:
     """Which experiment a run is of, where it says so: a run that goes on has no results yet."""
     if not results.is_file():
         return ""
-    try:
-        return json.loads(results.read_text())["experiment"]
-    except (ValueError, KeyError, TypeError) as error:
-        raise DataError(f"{results}: expected the results of a run, got {type(error).__name__}") from None
+    return choice(results, read_json(results, "the results of a run"), "experiment")

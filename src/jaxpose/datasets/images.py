@@ -12,6 +12,7 @@ from PIL import Image
 
 from jaxpose.errors import DataError
 from jaxpose.files.tables import read_numbers
+from jaxpose.files.untrusted import opened_image
 from jaxpose.geometry.rigid import nearest_rotation
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -35,14 +36,8 @@ class Pinhole(NamedTuple):
 
 def open_image(file: Path, use: Callable[[Image.Image], Any]) -> Any:
     """What `use` makes of an image file, of which Pillow reads only the header until pixels are asked for."""
-    if not file.is_file():
-        raise DataError(f"{file}: expected an image, got nothing")
-    try:
-        with Image.open(file) as image:
-            return use(image)
-    except Exception as error:  # Pillow raises many kinds on damaged files
-        found = " ".join(str(error).split()) or type(error).__name__
-        raise DataError(f"{file}: expected an image, got {found}") from None
+    with opened_image(file) as image:
+        return use(image)
 
 
 def image_size(file: Path) -> tuple[int, int]:

@@ -7,7 +7,7 @@ def load(path):
     """The trajectory of a file, in float64.
 
     Args:
-        path: a `field.npz`.
+        path: a `field.npz`, or a dict of what it holds.
 
     Returns:
         A function of times (n,) [s] to camera-to-world poses (n, 4, 4). Before its first time and after its
@@ -16,10 +16,13 @@ def load(path):
     Raises:
         ValueError: another file.
     """
-    with np.load(path, allow_pickle=False) as file:
-        data = {k: v.astype(float) if v.dtype.kind == "f" else v for k, v in file.items()}
-    if data.get("version") != 1:
-        raise ValueError(f"{path}: expected a trajectory of version 1, got {data.get('version', 'none')}")
+    if not isinstance(path, dict):
+        with np.load(path, allow_pickle=False) as file:
+            if file.get("version") != 1:
+                found = file.get("version", "none")
+                raise ValueError(f"{path}: expected a trajectory of version 1, got {found}")
+            return load(dict(file))
+    data = {k: v.astype(float) if v.dtype.kind == "f" else v for k, v in path.items()}
     names = [f"{number}." for number in range(data["count"])]
     factors = [{k.removeprefix(name): v for k, v in data.items() if k.startswith(name)} for name in names]
 

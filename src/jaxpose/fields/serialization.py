@@ -28,7 +28,6 @@ Where it is known how sure the pose is, the file holds too
                        from the pose
 """
 
-import zipfile
 from pathlib import Path
 from typing import NamedTuple
 
@@ -36,13 +35,13 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxpose._checks import check_shapes
-from jaxpose.errors import DataError
 from jaxpose.fields import _bspline, _per_frame, _posenet, composition
+from jaxpose.fields._entries import VERSION, read_entries
 from jaxpose.fields.types import Factor, Params, PoseField
 from jaxpose.files.atomic import atomic
+from jaxpose.files.untrusted import reading
 from jaxpose.geometry.rigid import Similarity
 
-VERSION = 1
 _FROM_FACTOR = {
     "posenet": _posenet.from_factor,
     "bspline": _bspline.from_factor,
@@ -123,19 +122,13 @@ def load(path: Path | str) -> tuple[PoseField, Params]:
     Raises:
         DataError: the file holds no trajectory of this version.
     """
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            data = dict(file)
-    except (ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise DataError(f"{path}: expected a trajectory, got {' '.join(str(error).split())}") from None
-    if data.get("version") != VERSION:
-        found = data.get("version", "none")
-        raise DataError(f"{path}: expected a trajectory of version {VERSION}, got {found}")
+    data = read_entries(path)
     parts = []
     for number in range(int(data["count"])):
         name = f"{number}."
         factor = {k.removeprefix(name): value for k, value in data.items() if k.startswith(name)}
-        parts.append(_FROM_FACTOR[str(factor["kind"])](factor))
+        with reading(path, "a trajectory"):
+            parts.append(_FROM_FACTOR[str(factor["kind"])](factor))
     if len(parts) == 1:
         return parts[0]
     fields, params = zip(*parts, strict=True)

@@ -1,12 +1,18 @@
 """The camera of a run folder, `camera.json`: intrinsics, and the name of each frame's image."""
 
-import json
+import reprlib
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 from jaxpose.errors import DataError
 from jaxpose.files.atomic import write_json
+from jaxpose.files.schema import choice, name_inside, numbers
+from jaxpose.files.untrusted import read_json
 from jaxpose.geometry.camera import Camera
+
+MOST_PIXELS = 100_000  # along one side of an image
+_MOST = 1e9  # [px] and coefficients of distortion
 
 
 class CameraFile(NamedTuple):
@@ -46,12 +52,17 @@ def read_camera(path: Path | str) -> CameraFile:
         raise DataError(
             f"{path}: expected the camera of a run, got nothing: runs of before it was written lack it"
         )
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        images, folder = tuple(content.pop("images")), Path(content.pop("images_folder"))
-        camera = Camera(**content | {"distortion": tuple(content["distortion"])})
-    except (ValueError, KeyError, TypeError) as error:
-        raise DataError(
-            f"{path}: expected the camera of a run, got {type(error).__name__}: {error}"
-        ) from None
-    return CameraFile(camera, images, path.parent / folder)
+    content = read_json(path, "the camera of a run")
+    number = partial(numbers, path, content)
+    lens = numbers(path, content, "distortion", (None,), least=-_MOST, most=_MOST)
+    if len(lens) not in (0, 4, 5):
+        raise DataError(f"{path}: distortion: expected 0, 4 or 5 numbers, got {len(lens)}")
+    fx, fy = (float(number(key, above=0, most=_MOST)) for key in ("fx", "fy"))
+    cx, cy = (float(number(key, least=-_MOST, most=_MOST)) for key in ("cx", "cy"))
+    width, height = (int(number(key, whole=True, least=1, most=MOST_PIXELS)) for key in ("width", "height"))
+    camera = Camera(fx, fy, cx, cy, width, height, tuple(lens.tolist()))
+    images = content.get("images")
+    if not isinstance(images, list) or not all(isinstance(name, str) for name in images):
+        raise DataError(f"{path}: images: expected a list of file names, got {reprlib.repr(images)}")
+    folder = path.parent / choice(path, content, "images_folder")
+    return CameraFile(camera, tuple(name_inside(path, name) for name in images), folder)

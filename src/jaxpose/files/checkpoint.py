@@ -1,6 +1,5 @@
 """Checkpoints: a pytree of arrays in one file, written whole or not at all."""
 
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +9,7 @@ import numpy as np
 
 from jaxpose.errors import DataError
 from jaxpose.files.atomic import atomic
+from jaxpose.files.untrusted import read_npz
 
 
 def save(path: Path | str, tree: Any) -> None:
@@ -37,14 +37,25 @@ def load(path: Path | str, like: Any) -> Any:
     Raises:
         DataError: Naming the file if it is damaged or holds other arrays.
     """
-    expected = _leaves(like)
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = dict(file)
-    except (zipfile.BadZipFile, ValueError, EOFError) as error:
-        raise DataError(f"{path}: expected a checkpoint, got {' '.join(str(error).split())}") from None
-    leaves = []
-    for at, leaf in expected:
+    return restore(path, read_npz(path, "a checkpoint"), like)
+
+
+def restore(path: Path | str, arrays: dict[str, np.ndarray], like: Any) -> Any:
+    """A tree from the arrays of a checkpoint.
+
+    Args:
+        path: The file they are of, for errors.
+        arrays: By their place in the tree.
+        like: A tree of the same structure, shapes and types.
+
+    Returns:
+        A tree like it.
+
+    Raises:
+        DataError: Naming the file if there are other arrays.
+    """
+    arrays, leaves = dict(arrays), []
+    for at, leaf in _leaves(like):
         name, data = jax.tree_util.keystr(at), _data(leaf)
         found = arrays.pop(name, None)
         if found is None or (found.shape, found.dtype) != (data.shape, data.dtype):

@@ -1,7 +1,5 @@
 """Kalibr's `camchain-imucam`: where a camera is on an IMU, and how far their clocks are apart."""
 
-import math
-import re
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,7 +8,11 @@ from jaxtyping import Float
 
 from jaxpose.errors import DataError
 from jaxpose.files import atomic
+from jaxpose.files.schema import numbers
+from jaxpose.files.untrusted import read_yaml
 from jaxpose.geometry import rigid
+
+_MOST_S = 1e6  # [s] between two clocks
 
 
 class CameraImu(NamedTuple):
@@ -50,27 +52,12 @@ def read_camchain(path: Path | str) -> CameraImu:
     Raises:
         DataError: no rigid `T_cam_imu` in it, or an offset that is no number.
     """
-    text = re.sub("#.*", "", Path(path).read_text(encoding="utf-8-sig", errors="replace"))
-    first = re.split(r"^cam1[ \t]*:", text, flags=re.MULTILINE)[0]
-    number = r"[-+.\deEnaif]+"
-    rows = re.search(r"T_cam_imu[ \t]*:((?:\s*-?\s*\[?\s*-?\s*\[[^\]]*\]\s*,?\s*\]?){4})", first)
-    words = re.findall(number, re.sub(r"-\s+\[|[\[\],]", " ", rows[1])) if rows else []
-    try:
-        T = np.array([float(word) for word in words]).reshape(4, 4)
-    except ValueError:
-        raise DataError(f"{path}: expected T_cam_imu of cam0 with 4 rows of 4 numbers") from None
-    if (
-        not np.isfinite(T).all()
-        or np.abs(T[3] - [0, 0, 0, 1]).max() > 1e-6
-        or not rigid.is_rotation(T[:3, :3], 1e-3)
-    ):
+    content = read_yaml(path, "a camchain").get("cam0")
+    T = numbers(path, content, "T_cam_imu", (4, 4))
+    if np.abs(T[3] - [0, 0, 0, 1]).max() > 1e-6 or not rigid.is_rotation(T[:3, :3], 1e-3):
         raise DataError(f"{path}: expected T_cam_imu to be a rigid transform, got {T.round(4).tolist()}")
     T[:3, :3] = rigid.nearest_rotation(T[:3, :3])
-    shift = re.search(r"timeshift_cam_imu[ \t]*:[ \t]*(\S+)", first)
-    try:
-        offset = float(shift[1]) if shift else 0.0
-    except ValueError:
-        offset = math.nan
-    if not math.isfinite(offset):
-        raise DataError(f"{path}: expected timeshift_cam_imu in seconds, got {shift[1] if shift else ''!r}")
+    offset = 0.0
+    if content and "timeshift_cam_imu" in content:
+        offset = float(numbers(path, content, "timeshift_cam_imu", least=-_MOST_S, most=_MOST_S))
     return CameraImu(rigid.inverse(T), offset)

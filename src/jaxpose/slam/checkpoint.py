@@ -1,15 +1,18 @@
 """A SLAM run on disk while it goes: its state, to go on from after a kill."""
 
-import zipfile
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxpose.datasets.types import Recording
 from jaxpose.errors import DataError
 from jaxpose.files import checkpoint as checkpoint_file
+from jaxpose.files.schema import numbers, rigid_transforms
+from jaxpose.files.untrusted import read_npz, reading
 from jaxpose.imu import Imu
 from jaxpose.scenes import GridConfig
 from jaxpose.scenes.voxel_blocks import BlockConfig, packed, unpacked
@@ -17,7 +20,9 @@ from jaxpose.slam.config import SlamConfig
 from jaxpose.slam.map.backend import map_backend
 from jaxpose.slam.pipeline import begin
 from jaxpose.slam.tracking.features import detect
-from jaxpose.slam.types import SlamState, no_frames
+from jaxpose.slam.types import SlamState, TrackingStatus, no_frames
+
+_FASTEST = 1e6  # [m/s, rad/s, m]
 
 
 def save(path: Path | str, state: SlamState) -> None:
@@ -32,16 +37,14 @@ def load(path: Path | str, recording: Recording, config: SlamConfig) -> SlamStat
     DataError naming the file if it is damaged or of another run.
     """
     kind = BlockConfig if config.map.method == "fused" else GridConfig
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            size = {name: file[f"['grid']['{name}']"].tolist() for name in asdict(kind())}
-            count = {name: len(file[f"['state'].{name}"]) for name in ("frames.t", "thumbnails")}
-            readings = len(file["['state'].imu.t"]) if "['state'].imu.t" in file else None
-            blocks = len(file["['state'].map.params[0]"])
-    except (zipfile.BadZipFile, ValueError, EOFError, KeyError) as error:
-        raise DataError(f"{path}: expected a checkpoint, got {' '.join(str(error).split())}") from None
-    size: dict[str, Any] = {k: tuple(x) if isinstance(x, list) else x for k, x in size.items()}
-    grid = kind(**size)
+    file = read_npz(path, "a checkpoint")
+    with reading(path, "a checkpoint"):
+        size = {name: file[f"['grid']['{name}']"].tolist() for name in asdict(kind())}
+        count = {name: len(file[f"['state'].{name}"]) for name in ("frames.t", "thumbnails")}
+        readings = len(file["['state'].imu.t"]) if "['state'].imu.t" in file else None
+        blocks = len(file["['state'].map.params[0]"])
+        size: dict[str, Any] = {k: tuple(x) if isinstance(x, list) else x for k, x in size.items()}
+        grid = kind(**size)
     state = begin(recording, config)._replace(
         frames=no_frames(np.zeros(count["frames.t"])),
         thumbnails=np.zeros((count["thumbnails"], 2, 12, 16)),
@@ -49,11 +52,12 @@ def load(path: Path | str, recording: Recording, config: SlamConfig) -> SlamStat
         grid=grid,
     )
     state = state._replace(map=map_backend(state).start())
-    state = checkpoint_file.load(path, _as_arrays(state, asdict(grid), blocks))["state"]
+    state = checkpoint_file.restore(path, file, _as_arrays(state, asdict(grid), blocks))["state"]
     if count["frames.t"] > len(recording.t) or (state.frames.t != recording.t[: count["frames.t"]]).any():
         raise DataError(
             f"{path}: expected a run over frames at the times of {recording.name}, got other times"
         )
+    _check(path, state)
     if isinstance(grid, BlockConfig):
         state = state._replace(map=state.map._replace(params=unpacked(grid, *state.map.params)))
     if config.uses_features:
@@ -67,6 +71,19 @@ def load(path: Path | str, recording: Recording, config: SlamConfig) -> SlamStat
         max_depth=float(state.max_depth),
         duration_s=float(state.duration_s),
     )
+
+
+def _check(path: Path | str, state: SlamState) -> None:
+    """DataError for a state that a run cannot have: poses that are none, NaN in what it goes on with."""
+    frames, motion = state.frames, state.motion
+    rigid_transforms(path, "frames.T_world_body", frames.T_world_body)
+    numbers(path, frames._asdict(), "status", (None,), whole=True, least=0, most=max(TrackingStatus))
+    for name in ("twist", "velocity_body", "gyro_bias", "accelerometer_bias_world"):
+        numbers(path, motion._asdict(), name, (None,), least=-_FASTEST, most=_FASTEST)
+    numbers(path, state._asdict(), "max_depth", above=0, most=_FASTEST)
+    for leaf in jax.tree.leaves((state.params, state.exposure, state.thumbnails, state.map)):
+        if jnp.issubdtype(leaf.dtype, jnp.floating) and not np.isfinite(leaf).all():
+            raise DataError(f"{path}: expected a map and a network of finite numbers, got NaN or infinity")
 
 
 def _as_arrays(state: SlamState, size: dict[str, Any], blocks: int | None = None) -> dict[str, Any]:

@@ -136,7 +136,7 @@ def test_npz_of_other_names_compressed_and_damaged(tmp_path):
         ):
             event_npz.load(path)
     np.savez(tmp_path / "a.npz", **{**raw, "x": raw["x"].astype(object)})
-    with pytest.raises(DataError, match=r"expected x as a row of numbers, got object of shape \(3000,\)"):
+    with pytest.raises(DataError, match=r"a.npz: expected a whole npz file, got entries of type \|O"):
         event_npz.load(tmp_path)
     np.savez(tmp_path / "a.npz", **raw)
     np.savez(tmp_path / "b.npz", **raw)
@@ -164,7 +164,7 @@ def test_dsec_folders_are_of_the_left_camera(tmp_path):
 def test_without_the_extra_hdf5_says_how_to_get_it(tmp_path, monkeypatch):
     write_h5(tmp_path / "events.h5", columns())
     monkeypatch.setitem(sys.modules, "hdf5plugin", None)
-    with pytest.raises(DataError, match=r"got no hdf5plugin: pip install 'jaxpose\[hdf5\]'"):
+    with pytest.raises(DataError, match=r'got no hdf5plugin: pip install -e "\.\[hdf5\]"'):
         event_hdf5.load(tmp_path)
 
 

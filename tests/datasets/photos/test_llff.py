@@ -131,7 +131,7 @@ def changed(row, column, value):
         (rows()[:1], "poses_bounds.npy: expected at least 3 views, 2 and one held out, got 1"),
         (rows()[:20], "images_4: expected 20 images, one for each row of poses_bounds.npy, got 29"),
         (rows()[:, :16], "expected rows of 17 numbers, got float64 of shape (29, 16)"),
-        (np.array([{"a": 1}]), "poses_bounds.npy: expected an array of numbers, got Object arrays cannot"),
+        (np.array([{"a": 1}]), "poses_bounds.npy: expected an array of numbers, got entries of type |O"),
     ],
 )
 def test_bad_tables(tmp_path, table, message):

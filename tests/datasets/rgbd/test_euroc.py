@@ -77,15 +77,24 @@ TRUTH = "state_groundtruth_estimate0/data.csv"
         (
             YAML,
             SENSOR.replace("gyroscope_random_walk", "x"),
-            f"{YAML}: expected gyroscope_random_walk with 1",
+            f"{YAML}: gyroscope_random_walk: expected a finite number above 0 up to 1000, got no such entry",
         ),
         (
             YAML,
             SENSOR.replace("1.9393e-05", "small"),
-            f"{YAML}:13: expected gyroscope_random_walk .* 'small'",
+            f"{YAML}: gyroscope_random_walk: expected .* 'small'",
         ),
-        (YAML, SENSOR.replace("-0.25,", ""), f"{YAML}:4: expected T_BS with 16 numbers"),
-        (YAML, SENSOR.replace("T_BS", "T_SB"), f"{YAML}: expected T_BS with 16 numbers, got no such key"),
+        (YAML, SENSOR.replace("-0.25,", ""), f"{YAML}: T_BS: expected 16 finite numbers, got shape .15"),
+        (
+            YAML,
+            SENSOR.replace("0.0, 0.0, 1.0,", "0.0, 0.0, 2.0,"),
+            f"{YAML}: T_BS: expected rigid transforms",
+        ),
+        (
+            YAML,
+            SENSOR.replace("T_BS", "T_SB"),
+            f"{YAML}: T_BS: expected 16 finite numbers, got no such entry",
+        ),
     ],
 )
 def test_unusable_files(sequence, file, content, message):

@@ -191,7 +191,7 @@ def test_without_depth_it_says_where_it_looked(vicon):
         euroc.load(vicon)
 
 
-SHEET = CAMERA_SHEET.format(pose="1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1")
+SHEET = CAMERA_SHEET.format(pose="1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1")
 
 
 @pytest.mark.parametrize(
@@ -215,15 +215,19 @@ SHEET = CAMERA_SHEET.format(pose="1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1")
         (
             "cam0/sensor.yaml",
             SHEET.replace("radial-tangential", "equidistant"),
-            "cam0/sensor.yaml: expected distortion_model radial-tangential, got 'equidistant'",
+            "cam0/sensor.yaml: distortion_model: expected one of radial-tangential, got 'equidistant'",
         ),
-        ("cam0/sensor.yaml", SHEET.replace("distortion_m", "m"), "expected distortion_model .* no such key"),
+        (
+            "cam0/sensor.yaml",
+            SHEET.replace("distortion_m", "m"),
+            "distortion_model: expected .* no such entry",
+        ),
         (
             "cam0/sensor.yaml",
             SHEET.replace("[32, 24]", "[24, 32]"),
             "yaml: expected the images' res.*, 32x24",
         ),
-        ("cam0/sensor.yaml", SHEET.replace("20.5,", ""), "yaml:10: expected intrinsics with 4 numbers, got"),
+        ("cam0/sensor.yaml", SHEET.replace("20.5,", ""), "yaml: intrinsics: expected 4 finite numbers"),
         ("depth0/data.csv", "5,a.png\n", "depth0/data.csv: expected timestamps of cam0, got 5"),
         ("depth0/data.csv", f"{STAMPS[0]},a.png\n", "depth0/data/a.png: expected an image, got nothing"),
     ],

@@ -121,7 +121,7 @@ def test_a_mounting_is_16_numbers_or_a_data_sheet(desk):
     [
         ("1 0 0\n", "expected T_BS, or the 16 numbers of a 4x4 T_body_cam, got '1 0 0'"),
         ("camera: left\n", "expected T_BS, or the 16 numbers of a 4x4 T_body_cam, got 'camera: left'"),
-        ("T_BS:\n  data: [1, 0]\n", "expected T_BS with 16 numbers, got '1, 0'"),
+        ("T_BS:\n  data: [1, 0]\n", "T_BS: expected 16 finite numbers, got shape (2,)"),
         ("2 0 0 0  0 1 0 0  0 0 1 0  0 0 0 1", "expected a rotation, got a matrix 1 off one"),
         ("1 0 0 0  0 1 0 0  0 0 1 0  1 2 3 1", "expected a last row 0 0 0 1, got 1 2 3 1"),
         ("nan 0 0 0  0 1 0 0  0 0 1 0  0 0 0 1", "got 'nan 0 0 0 0 1 0 0"),

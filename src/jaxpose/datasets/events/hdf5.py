@@ -12,6 +12,7 @@ from jaxpose.datasets.images import only, some
 from jaxpose.datasets.types import EventRecording
 from jaxpose.errors import DataError
 from jaxpose.events import Mosaic
+from jaxpose.files.untrusted import hdf5_column, opened_hdf5
 
 _SUFFIXES = (".h5", ".hdf5")
 _NAMES = ("t", "x", "y", "p")
@@ -98,35 +99,25 @@ def _file(path: Path) -> Path:
 
 
 def _blocks(file: Path) -> Iterator[Block]:
-    try:
-        import h5py
-        import hdf5plugin  # noqa: F401  # DSEC's files are compressed with one of its filters
-    except ImportError as error:
-        raise DataError(
-            f"{file}: expected h5py and hdf5plugin to read it, got no {error.name}: "
-            "pip install 'jaxpose[hdf5]'"
-        ) from None
-    try:
-        with h5py.File(file) as content:
-            columns = [_column(file, content, name) for name in _NAMES]
-            lengths = {len(column) for column in columns}
-            if len(lengths) != 1:
-                got = ", ".join(f"{len(column)} {name}" for name, column in zip(_NAMES, columns, strict=True))
-                raise DataError(f"{file}: expected events/ with columns of one length, got {got}")
-            offset = int(np.asarray(content.get("t_offset", 0)))
-            for start in range(0, lengths.pop(), BLOCK):
-                t, *others = (column[start : start + BLOCK] for column in columns)
-                if t.dtype.kind in "iu":
-                    t = t.astype(np.int64)
-                yield Block(t + offset, *others)
-    except OSError as error:
-        raise DataError(f"{file}: expected an HDF5 file, got {' '.join(str(error).split())}") from None
+    with opened_hdf5(file, "an HDF5 file") as content:
+        columns = [_column(file, content, name) for name in _NAMES]
+        lengths = {len(column) for column in columns}
+        if len(lengths) != 1:
+            got = ", ".join(f"{len(column)} {name}" for name, column in zip(_NAMES, columns, strict=True))
+            raise DataError(f"{file}: expected events/ with columns of one length, got {got}")
+        offset = int(np.asarray(content.get("t_offset", 0)))
+        for start in range(0, lengths.pop(), BLOCK):
+            t, *others = (column[start : start + BLOCK] for column in columns)
+            if t.dtype.kind in "iu":
+                t = t.astype(np.int64)
+            yield Block(t + offset, *others)
 
 
 def _column(file: Path, content: Any, name: str) -> Any:
     """The data set of one column."""
-    column = content.get(f"events/{name}")
-    if column is None or getattr(column, "ndim", None) != 1:
-        got = some(sorted(content.get("events", content))) or "none"
+    column = hdf5_column(content, f"events/{name}")
+    if column is None:
+        events = content.get("events")
+        got = some(sorted(events if hasattr(events, "keys") else content)) or "none"
         raise DataError(f"{file}: expected events/ with x y p t, a row of numbers each, got {got}")
     return column

@@ -9,6 +9,7 @@ from jaxpose.datasets.images import SUFFIXES, image_size
 from jaxpose.datasets.photos.common import OPENGL, check_poses, frame_numbers, read_images
 from jaxpose.datasets.types import Photographs, take
 from jaxpose.errors import DataError
+from jaxpose.files.untrusted import read_npy
 from jaxpose.geometry import rigid
 from jaxpose.geometry.camera import Camera
 
@@ -69,13 +70,9 @@ def _read_rows(file: Path) -> Float[np.ndarray, "n 17"]:
     """The table of poses and bounds, checked for what does not need the images."""
     if not file.is_file():
         raise DataError(f"{file}: expected a file of poses and bounds, got nothing")
-    try:
-        rows = np.load(file, allow_pickle=False)
-    except (ValueError, EOFError) as error:
-        raise DataError(f"{file}: expected an array of numbers, got {' '.join(str(error).split())}") from None
-    if not isinstance(rows, np.ndarray) or rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind != "f":
-        found = f"{rows.dtype} of shape {rows.shape}" if isinstance(rows, np.ndarray) else "an archive"
-        raise DataError(f"{file}: expected rows of 17 numbers, got {found}")
+    rows = read_npy(file, "an array of numbers")
+    if rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind != "f":
+        raise DataError(f"{file}: expected rows of 17 numbers, got {rows.dtype} of shape {rows.shape}")
     if len(rows) < 3:
         raise DataError(f"{file}: expected at least 3 views, 2 and one held out, got {len(rows)}")
     rows = rows.astype(np.float64)

@@ -1,17 +1,21 @@
 """Files of the ASL layout: tables of stamped values or images, and the data sheets in `sensor.yaml`."""
 
-import math
-import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxpose.errors import DataError
+from jaxpose.files.camera_json import MOST_PIXELS
+from jaxpose.files.schema import choice, numbers, rigid_transforms
 from jaxpose.files.tables import StampedRows, read_stamped, read_stamped_names
+from jaxpose.files.untrusted import read_yaml
 from jaxpose.geometry.camera import Camera
 from jaxpose.imu import ImuNoise
 
+_LOUDEST = 1e3  # of noise densities
+_MOST = 1e9  # [px] and coefficients of distortion
 IMU_COLUMNS = "7 columns (timestamp, 3 rates, 3 accelerations)"
 
 
@@ -43,54 +47,45 @@ def read_listing(folder: Path) -> tuple[list[int], list[Path]]:
 
 def read_imu_sheet(file: Path) -> tuple[ImuNoise, Float[np.ndarray, "4 4"]]:
     """Noise densities and the pose of the IMU on the body."""
-    text = _read_yaml(file)
-    scalar = lambda key: _numbers(file, text, rf"^{key}[ \t]*:(.*)$", key, 1)[0]
+    content = _sheet(file)
+    scalar = lambda key: float(numbers(file, content, key, above=0, most=_LOUDEST))
     noise = ImuNoise(
         gyro_density=scalar("gyroscope_noise_density"),
         accelerometer_density=scalar("accelerometer_noise_density"),
         gyro_walk=scalar("gyroscope_random_walk"),
         accelerometer_walk=scalar("accelerometer_random_walk"),
     )
-    return noise, read_extrinsics(file)
+    return noise, _extrinsics(file, content)
 
 
 def read_camera_sheet(file: Path) -> tuple[Camera, Float[np.ndarray, "4 4"]]:
     """Intrinsics, lens and the pose of a camera on the body."""
-    text = _read_yaml(file)
-    model = re.search(r"^distortion_model[ \t]*:[ \t]*(\S*)", text, re.MULTILINE)
-    if model is None or model[1] != "radial-tangential":
-        got = "no such key" if model is None else repr(model[1])
-        raise DataError(f"{file}: expected distortion_model radial-tangential, got {got}")
-    row = lambda key, count: _numbers(file, text, rf"^{key}[ \t]*:[^\[\n]*\[([^\]]*)\]", key, count)
-    lens, size = row("distortion_coefficients", 4), row("resolution", 2)
-    fx, fy, cx, cy = row("intrinsics", 4)
-    camera = Camera(fx, fy, cx, cy, int(size[0]), int(size[1]), tuple(lens) if any(lens) else ())
-    return camera, read_extrinsics(file)
-
-
-def _read_yaml(file: Path) -> str:
-    """The text without comments: a few keys of a fixed layout do not need a YAML package."""
-    return re.sub("#.*", "", _existing(file).read_text(encoding="utf-8-sig", errors="replace"))
+    content = _sheet(file)
+    choice(file, content, "distortion_model", ("radial-tangential",))
+    lens = numbers(file, content, "distortion_coefficients", (4,), least=-_MOST, most=_MOST).tolist()
+    width, height = numbers(file, content, "resolution", (2,), whole=True, least=1, most=MOST_PIXELS).tolist()
+    fx, fy, cx, cy = numbers(file, content, "intrinsics", (4,), least=-_MOST, most=_MOST).tolist()
+    if not (fx > 0 and fy > 0 and 0 <= cx < width and 0 <= cy < height):
+        raise DataError(
+            f"{file}: intrinsics: expected fx, fy above 0 and cx, cy in {width}x{height}, got "
+            f"{fx:g} {fy:g} {cx:g} {cy:g}"
+        )
+    camera = Camera(fx, fy, cx, cy, width, height, tuple(lens) if any(lens) else ())
+    return camera, _extrinsics(file, content)
 
 
 def read_extrinsics(file: Path) -> Float[np.ndarray, "4 4"]:
     """The pose of the sensor on the body (`T_BS`)."""
-    return np.array(_numbers(file, _read_yaml(file), r"^T_BS[ \t]*:[^\[]*\[([^\]]*)\]", "T_BS", 16)).reshape(
-        4, 4
-    )
+    return _extrinsics(file, _sheet(file))
 
 
-def _numbers(file: Path, text: str, pattern: str, key: str, count: int) -> list[float]:
-    """The `count` finite numbers that `pattern` captures behind `key`."""
-    wanted = f"{key} with {count} {'number' if count == 1 else 'numbers'}"
-    match = re.search(pattern, text, re.MULTILINE)
-    if match is None:
-        raise DataError(f"{file}: expected {wanted}, got no such key")
-    try:
-        numbers = [float(word) for word in match[1].replace(",", " ").split()]
-    except ValueError:
-        numbers = []
-    if len(numbers) != count or not all(map(math.isfinite, numbers)):
-        line = text[: match.start()].count("\n") + 1
-        raise DataError(f"{file}:{line}: expected {wanted}, got {' '.join(match[1].split())[:60]!r}")
-    return numbers
+def _sheet(file: Path) -> dict[str, Any]:
+    return read_yaml(_existing(file), "a data sheet")
+
+
+def _extrinsics(file: Path, content: dict[str, Any]) -> Float[np.ndarray, "4 4"]:
+    matrix = content.get("T_BS")  # OpenCV's rows, cols and data
+    found = {"T_BS": matrix.get("data") if isinstance(matrix, dict) else matrix} if "T_BS" in content else {}
+    T = numbers(file, found, "T_BS", (16,)).reshape(4, 4)
+    rigid_transforms(file, "T_BS", T[None])
+    return T

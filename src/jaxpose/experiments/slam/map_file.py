@@ -1,7 +1,7 @@
 """The map of a SLAM run as its folder keeps it, `map.npz`."""
 
-import zipfile
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,10 +10,14 @@ from jaxtyping import Int
 
 from jaxpose.errors import DataError
 from jaxpose.files import atomic
-from jaxpose.scenes.voxel_blocks import CHANNELS, BlockConfig, Blocks, packed, unpacked
-from jaxpose.slam.map.texture import Texture
+from jaxpose.files.schema import numbers
+from jaxpose.files.untrusted import read_npz
+from jaxpose.scenes.voxel_blocks import CHANNELS, NODES, BlockConfig, Blocks, packed, unpacked
+from jaxpose.slam.map.texture import SIDE, Texture
 
 _VERSION = 3
+_LARGEST_M = 1e4  # of voxels and distances
+_FARTHEST_BLOCK = 511  # from the origin: a table of 1024^3
 
 
 class SavedMap(NamedTuple):
@@ -47,18 +51,31 @@ def write_map(path: Path | str, saved: SavedMap) -> None:
 
 
 def read_map(path: Path | str) -> SavedMap:
-    """Read what `write_map` wrote; DataError naming the file for what is not that."""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            content = dict(file)
-        if content["version"] != _VERSION:
-            raise DataError(f"{path}: expected a map of version {_VERSION}, got {content['version']}")
-        config = BlockConfig(float(content["voxel"]), float(content["truncation"]))
-        values = np.pad(content["values"], [(0, 0)] * 4 + [(0, CHANNELS - 4)])
-        blocks = unpacked(config, content["coords"], values)
-        slot = np.zeros(blocks.coords.shape[0], np.int32)
-        slot[1 : len(values) + 1] = content["texture_slot"]
-        texture = Texture(slot, content["texture_tiles"])
-        return SavedMap(config, blocks, texture, content["keyframes"])
-    except (zipfile.BadZipFile, ValueError, KeyError, EOFError) as error:
-        raise DataError(f"{path}: expected a map, got {' '.join(str(error).split())}") from None
+    """Read what `write_map` wrote; DataError naming file and entry for what is not that."""
+    content = read_npz(path, "a map")
+    version = content.get("version", "none")
+    if not np.array_equal(version, _VERSION):
+        raise DataError(f"{path}: expected a map of version {_VERSION}, got {version!s:.40}")
+    number = partial(numbers, path, content)
+    voxel, truncation = (float(number(key, above=0, most=_LARGEST_M)) for key in ("voxel", "truncation"))
+    config = BlockConfig(voxel, truncation)
+    coords = number("coords", (None, 3), whole=True)
+    count, reach = len(coords), int(np.abs(coords).max(initial=0))
+    if reach > min(_FARTHEST_BLOCK, count + 64) or len(np.unique(coords, axis=0)) != count:
+        raise DataError(f"{path}: coords: expected blocks beside each other, got {reach} of {count} away")
+    number("values", (count, NODES, NODES, NODES, 4), least=-_LARGEST_M, most=_LARGEST_M)
+    values = np.pad(content["values"].astype(np.float32), [(0, 0)] * 4 + [(0, CHANNELS - 4)])
+    blocks = unpacked(config, coords, values)
+    tiles = content.get("texture_tiles")
+    if (
+        tiles is None
+        or tiles.dtype != np.uint8
+        or tiles.ndim != 5
+        or tiles.shape[1:] != (SIDE, SIDE, SIDE, 4)
+    ):
+        got = "none" if tiles is None else f"{tiles.dtype} of shape {tiles.shape}"
+        raise DataError(f"{path}: texture_tiles: expected uint8 of n tiles of {SIDE}^3 x 4, got {got}")
+    slot = np.zeros(blocks.coords.shape[0], np.int32)
+    slot[1 : count + 1] = number("texture_slot", (count,), whole=True, least=0, most=len(tiles) - 1)
+    keyframes = number("keyframes", (None,), whole=True, least=0)
+    return SavedMap(config, blocks, Texture(slot, tiles), keyframes)

@@ -23,7 +23,7 @@ from jaxpose.slam.map.normals import seen_by
 from jaxpose.slam.observation import locate
 
 _FINER = 2  # texture cells along one of the map's
-_SIDE = _FINER * CELLS + 1  # nodes along each side of a tile, which is a block with its outer nodes
+SIDE = _FINER * CELLS + 1  # nodes along each side of a tile, which is a block with its outer nodes
 _THICKNESS = 1.2  # texture cells to either side of the surface
 _SAME = 2.0  # cells of the map that a measured surface may be off the map's
 _PAINTED = 0.25  # weight of painted nodes around a point from which on they give its colour
@@ -51,7 +51,7 @@ def make_texture(
     count, capacity = int(blocks.count), blocks.coords.shape[0]
     rows, near = _near_surface(config, np.asarray(blocks.values[:count, ..., 0]))
     if not len(rows):
-        return Texture(np.zeros(capacity, np.int32), np.zeros((1, _SIDE, _SIDE, _SIDE, 4), np.uint8))
+        return Texture(np.zeros(capacity, np.int32), np.zeros((1, SIDE, SIDE, SIDE, 4), np.uint8))
     # The nodes near the surface of all tiles in turn, those of a few tiles next to each other in one chunk.
     tile, *within = np.nonzero(near)
     index = _FINER * CELLS * np.asarray(blocks.coords)[rows][tile] + np.stack(within, axis=-1)
@@ -66,7 +66,7 @@ def make_texture(
         total = add(total, *on_device, keyframe.image, jnp.asarray(keyframe.T_world_cam, jnp.float32))
     rgb, weight = np.split(np.asarray(total).reshape(-1, 4)[: len(index)], [3], axis=-1)
     there = weight[:, 0] > 0
-    tiles = np.zeros((len(rows) + 1, _SIDE, _SIDE, _SIDE, 4), np.uint8)
+    tiles = np.zeros((len(rows) + 1, SIDE, SIDE, SIDE, 4), np.uint8)
     place = (tile[there] + 1, *(x[there] for x in within))
     tiles[(*place, slice(0, 3))] = np.round(255 * rgb[there] / weight[there])
     tiles[(*place, 3)] = 255
