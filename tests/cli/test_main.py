@@ -143,7 +143,7 @@ def files(tmp_path, monkeypatch):
     ("args", "expected"),
     [
         # a folder or file that is not there
-        ("slam --data none", "none: expected a folder of"),
+        ("slam --data none", "none: expected a recording"),
         ("nerf --data none", "none: expected a folder of photographs"),
         ("events --data none", "none: expected a recording of events"),
         ("planar --image none.png", "none.png"),
@@ -153,8 +153,8 @@ def files(tmp_path, monkeypatch):
         ("export none --format tum --out x", "none: expected a trajectory file"),
         ("view none", "none: expected a trajectory file"),
         # of the wrong kind
-        ("slam --data empty", "empty: expected a folder of"),
-        ("slam --data text.txt", "text.txt: expected a folder of"),
+        ("slam --data empty", "empty: expected a recording"),
+        ("slam --data text.txt", "text.txt: expected a recording"),
         ("nerf --data empty", "empty: expected transforms_train.json"),
         ("events --data other.npz", "other.npz"),
         ("planar --image text.txt", "text.txt: expected an image"),

@@ -13,6 +13,7 @@ from jaxpose.experiments import imu_slam, rgbd_slam
 from jaxpose.experiments.slam.source import load
 
 LAYOUTS = {
+    "ros": ["walk.bag"],
     "sevenscenes": ["frame-000000.color.png", "frame-000000.depth.png", "camera-intrinsics.txt"],
     "tum": ["rgb.txt", "depth.txt", "groundtruth.txt", "rgb/1.png", "depth/1.png"],
     "replica": ["traj.txt", "results/frame000000.jpg", "results/depth000000.png"],
@@ -23,17 +24,22 @@ LAYOUTS = {
 }
 
 
+MAGIC = {".bag": b"#ROSBAG V2.0\n"}  # of files that are known by their first bytes
+
+
 def touch(folder, files):
     for file in files:
         (folder / file).parent.mkdir(parents=True, exist_ok=True)
-        (folder / file).touch()
+        (folder / file).write_bytes(MAGIC.get((folder / file).suffix, b""))
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_formats_are_told_apart_and_their_loader_is_asked(tmp_path, name):
     touch(tmp_path, LAYOUTS[name])
     assert rgbd_registry.find_format(tmp_path) == rgbd_registry.find_format(str(tmp_path)) == name
-    with pytest.raises(DataError, match=r"expected (an image|lines of (a timestamp|N depth/N.png))"):
+    with pytest.raises(
+        DataError, match=r"expected (an image|lines of (a timestamp|N depth/N.png)|a ROS bag)"
+    ):
         rgbd_registry.load_recording(tmp_path)
 
 
@@ -65,25 +71,47 @@ def test_every_format_has_a_layout():
     assert set(LAYOUTS) == set(get_args(rgbd_registry.Format))
 
 
-def test_a_wrong_folder_is_told_what_was_expected_and_found(tmp_path):
+def refusal(path):
+    with pytest.raises(DataError) as error:
+        rgbd_registry.load_recording(path)
+    assert str(error.value).startswith(f"{path}: expected a recording (") and "\n" not in str(error.value)
+    for layout in rgbd_registry.LAYOUTS.values():
+        assert layout.title in str(error.value)
+    return str(error.value).partition(", got ")[2]
+
+
+def test_a_wrong_path_is_told_what_is_there(tmp_path):
     (tmp_path / "empty").mkdir()
     (tmp_path / "file").touch()
-    for path, got in [
-        (tmp_path, "empty, file"),
-        (tmp_path / "empty", "an empty folder"),
-        (tmp_path / "file", "a file"),
-        (tmp_path / "nowhere", "nothing"),
-    ]:
-        with pytest.raises(DataError) as error:
-            rgbd_registry.load_recording(path)
-        message = str(error.value)
-        assert message.startswith(f"{path}: expected a folder of ") and message.endswith(f", got {got}")
-        assert "\n" not in message
-        for name in LAYOUTS:
-            assert f"({name})" in message
-        lists = ("rgb.txt", "traj.txt", "associations.txt")
-        for file in ("frame-NNNNNN.color.png", *lists, "pose/", "mav0", "color/"):
-            assert file in message
+    (tmp_path / "desk.zip").touch()
+    assert refusal(tmp_path / "empty") == "an empty folder"
+    assert refusal(tmp_path / "file") == "a file"
+    assert refusal(tmp_path / "desk.zip") == "a file to be unpacked first"
+    assert refusal(tmp_path / "nowhere") == "nothing"
+    assert refusal(tmp_path) == "desk.zip, empty, file"
+
+
+@pytest.mark.parametrize(
+    "files, got",
+    [
+        (["notes.txt", "intrinsics.json"], "a plain folder (plain), without color/* and depth/*"),
+        (["frame-0001.color.png"], "7-Scenes (sevenscenes), without frame-*.depth.png"),
+    ],
+)
+def test_a_wrong_folder_is_told_the_nearest_format_and_what_it_lacks(tmp_path, files, got):
+    touch(tmp_path, files)
+    assert f": the nearest is {got}" in refusal(tmp_path)
+
+
+def test_a_folder_of_recordings_names_them(tmp_path):
+    touch(tmp_path / "desk", LAYOUTS["tum"])
+    touch(tmp_path / "walk", LAYOUTS["ros"])
+    assert refusal(tmp_path) == "a folder of recordings, name one: desk (tum), walk (ros)"
+
+
+def test_topics_are_of_bags_only(desk):
+    with pytest.raises(DataError, match="expected a ROS bag to choose topics of, got a plain folder"):
+        rgbd_registry.load_recording(desk, topics=("/imu",))
 
 
 @pytest.fixture

@@ -1,9 +1,11 @@
 """Photographs in part, frames as the library takes them, and what recordings share."""
 
+import threading
+
 import numpy as np
 import pytest
 
-from jaxpose.datasets.types import Frame, Photographs, Recording, check_frame, every, take
+from jaxpose.datasets.types import Frame, Photographs, Recording, check_frame, every, prefetch, take
 from jaxpose.errors import DataError
 from jaxpose.geometry.camera import Camera
 
@@ -81,3 +83,22 @@ def test_a_frame_in_metres_is_taken_whatever_its_type():
 def test_a_frame_that_is_none_is_named(rgb, depth, message):
     with pytest.raises(ValueError, match=message):
         check_frame(Frame(rgb, depth), CAMERA)
+
+
+def test_frames_are_read_ahead_in_one_thread():
+    asked, threads = [], set()
+
+    def read(i):
+        asked.append(i)
+        threads.add(threading.get_ident())
+        if i == 3:
+            raise DataError("3.png: expected an image, got nothing")
+        return Frame(RGB, DEPTH + i)
+
+    recording = prefetch(Recording("r", CAMERA, np.arange(5.0), read))
+    for i in (0, 1, 2, 1, 4):
+        assert recording.read(i).depth[0, 0] == 2.5 + i
+    with pytest.raises(DataError, match="3.png"):  # when it is asked for, not before
+        recording.read(3)
+    assert len(threads) == 1 and threading.get_ident() not in threads
+    assert set(asked) == {0, 1, 2, 3, 4}

@@ -11,6 +11,7 @@ from .types import Photographs as Photographs
 from .types import Recording as Recording
 from .types import every as every
 from .types import from_arrays as from_arrays
+from .types import prefetch as prefetch
 from .types import select as select
 from .types import take as take
 from .types import thin as thin

@@ -81,12 +81,24 @@ def read_depth(file: Path, per_metre: float = 1000.0) -> np.ndarray:
 
 def check_depth(folder: Path, files: Sequence[Path], per_metre: float = 1000.0) -> None:
     """Refuse a sequence whose depth, looked at here and there, is never valid."""
-    rows = sorted({round(row) for row in np.linspace(0, len(files) - 1, _DEPTH_SAMPLES)})
-    if not any(read_depth(files[row], per_metre).any() for row in rows):
-        looked_at = some([files[row].name for row in rows])
-        raise DataError(
-            f"{folder}: expected depth in {_unit(per_metre)}, got only 0 and {_NONE} (none) in {looked_at}"
-        )
+    unit = f"depth in {_unit(per_metre)}"
+    check_some_depth(
+        folder, len(files), lambda i: read_depth(files[i], per_metre), lambda i: files[i].name, unit
+    )
+
+
+def check_some_depth(
+    where: Path | str,
+    count: int,
+    depth: Callable[[int], np.ndarray],
+    name: Callable[[int], str],
+    unit: str = "depth",
+) -> None:
+    """Refuse `count` images whose depth, looked at here and there, is never valid."""
+    rows = sorted({round(row) for row in np.linspace(0, count - 1, _DEPTH_SAMPLES)})
+    if not any(depth(row).any() for row in rows):
+        looked_at = some([name(row) for row in rows])
+        raise DataError(f"{where}: expected {unit}, got only 0 and {_NONE} (none) in {looked_at}")
 
 
 def _unit(per_metre: float) -> str:

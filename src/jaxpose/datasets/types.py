@@ -1,6 +1,7 @@
 """What a loader returns: a recording with depth, photographs, or events, and what is known about them."""
 
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -212,6 +213,31 @@ def thin(recording: Recording, rate_hz: float) -> Recording:
         raise ValueError(f"rate_hz: expected a positive number, got {rate_hz}")
     period = np.floor((recording.t - recording.t[0]) * rate_hz + 1e-6).astype(int)
     return select(recording, np.flatnonzero(np.diff(period, prepend=-1) > 0))
+
+
+def prefetch(recording: Recording) -> Recording:
+    """The recording whose next frame is read in a thread while one is worked on.
+
+    Args:
+        recording: Of frames that are mostly read one after the other.
+
+    Returns:
+        The same; all of its frames are read in that one thread.
+    """
+    worker = ThreadPoolExecutor(1, "frames")
+    ahead: dict[int, Future[Frame]] = {}
+
+    def read(i: int) -> Frame:
+        asked = ahead.pop(i, None) or worker.submit(recording.read, i)
+        for other in ahead.values():
+            other.cancel()
+        ahead.clear()
+        frame = asked.result()
+        if i + 1 < len(recording.t):
+            ahead[i + 1] = worker.submit(recording.read, i + 1)
+        return frame
+
+    return recording._replace(read=read)
 
 
 def take(photographs: Photographs, indices: Int[np.ndarray, " m"]) -> Photographs:

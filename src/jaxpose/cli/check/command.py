@@ -18,6 +18,7 @@ import tyro
 from jaxpose.cli.check.findings import Checked, Fact, Finding
 from jaxpose.errors import DataError
 from jaxpose.experiments.command import Command, execute
+from jaxpose.experiments.outcome import markdown_table
 from jaxpose.experiments.progress import OnUpdate, Update, silent
 
 _KNOWN = (
@@ -31,8 +32,17 @@ _KNOWN = (
 class Config:
     """What to check."""
 
-    data: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")]  # folder, or trajectory file
+    # folder, bag, or trajectory file; nothing with --formats
+    data: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")] = None
+    topics: tuple[str, ...] = ()  # of a ROS bag, those to use before others of their kind
+    formats: bool = False  # print which recordings are read, as a table
     json: bool = False  # print all that was found as JSON and nothing else
+
+
+class Formats(NamedTuple):
+    """The recordings that are read: what each is called, its name as an option, its files, and its tests."""
+
+    rows: tuple[tuple[str, str, str, str], ...]
 
 
 class Result(NamedTuple):
@@ -45,7 +55,7 @@ class Result(NamedTuple):
     notes: tuple[str, ...]  # what loaders skipped or assumed, and what could not be tested
 
 
-def run(config: Config, on_update: OnUpdate = silent) -> Result:
+def run(config: Config, on_update: OnUpdate = silent) -> Result | Formats:
     """Find the format of the data and test them.
 
     Args:
@@ -53,21 +63,25 @@ def run(config: Config, on_update: OnUpdate = silent) -> Result:
         on_update: called with what is being done.
 
     Returns:
-        What they are, and the outcome of every test.
+        What they are, and the outcome of every test; with `formats` what is read.
 
     Raises:
         DataError, OSError: for what cannot be used.
     """
-    on_update(Update(f"checking {config.data}", quiet=True))
+    if config.formats:
+        return _formats()
     path = config.data
-    if path.is_file() and path.suffix not in (".json", ".npz", ".h5", ".hdf5"):
+    if path is None:
+        raise DataError("expected DATA to check, or --formats for what is read, got neither")
+    on_update(Update(f"checking {path}", quiet=True))
+    if path.is_file() and path.suffix not in (".json", ".npz", ".h5", ".hdf5") and not _is_recording(path):
         from jaxpose.cli.check.trajectory import check_trajectory
 
         form, checked = check_trajectory(path)
         return Result(path, f"{form} trajectory", *checked)
     if not path.exists():
         raise DataError(f"{path}: expected {_KNOWN}, got nothing")
-    form, checked = _folder(path)
+    form, checked = _folder(path, config.topics)
     return Result(path, form, *checked)
 
 
@@ -82,8 +96,10 @@ def main(args: Sequence[str] | None = None, prog: str = "jaxpose check") -> None
         sys.exit(code)
 
 
-def report(result: Result) -> str:
+def report(result: Result | Formats) -> str:
     """What was found, a line each, warnings and errors last."""
+    if isinstance(result, Formats):
+        return markdown_table([("recordings of", "format", "files", "tested with"), *result.rows])
     width = max(10, *(len(name) for name, *_ in result.facts), *(len(f.test) for f in result.findings)) + 9
     lines = [("format", f"{result.path}  {result.format}")]
     lines += [(fact.name, fact.text) for fact in result.facts]
@@ -94,8 +110,10 @@ def report(result: Result) -> str:
     return "\n".join([*told, "", f"  {_verdict(result)}"])
 
 
-def exit_code(result: Result) -> int:
+def exit_code(result: Result | Formats) -> int:
     """0: no fault found; 2: warnings; 1: unusable."""
+    if isinstance(result, Formats):
+        return 0
     severities = {finding.severity for finding in result.findings}
     return 1 if "error" in severities else 2 if "warning" in severities else 0
 
@@ -108,15 +126,31 @@ def _verdict(result: Result) -> str:
     return f"{counts['warning']} warning{plural}" if counts["warning"] else "no fault found"
 
 
-def _folder(path: Path) -> tuple[str, Checked]:
-    """The format of a folder (or json file), in words, and what is found in it."""
+def _formats() -> Formats:
+    """What the registry of recordings says of itself."""
+    from jaxpose.datasets.rgbd import registry as rgbd_registry
+
+    rows = []
+    for name, layout in rgbd_registry.LAYOUTS.items():
+        files = ", ".join(f"`{rgbd_registry.words(part)}`" for part in layout.files)
+        rows.append((layout.title, name, files, layout.tested))
+    return Formats(tuple(rows))
+
+
+def _is_recording(path: Path) -> bool:
+    from jaxpose.datasets.rgbd import registry as rgbd_registry
+
+    return rgbd_registry.detect(path) is not None
+
+
+def _folder(path: Path, topics: Sequence[str]) -> tuple[str, Checked]:
+    """The format of a folder (or of a file that is no trajectory), in words, and what is found in it."""
     # Here, as the loaders load jax, which --help does without.
     from jaxpose.cli.check import events as check_events
     from jaxpose.cli.check import inertial as check_inertial
     from jaxpose.cli.check import photographs as check_photographs
     from jaxpose.cli.check import recording as check_recording
     from jaxpose.cli.check.trajectory import check_trajectories
-    from jaxpose.datasets.images import found
     from jaxpose.datasets.rgbd import euroc
     from jaxpose.datasets.rgbd import registry as rgbd_registry
 
@@ -131,11 +165,10 @@ def _folder(path: Path) -> tuple[str, Checked]:
         return "photographs, LLFF (poses_bounds.npy)", check_photographs.check_photographs(path, "llff")
     if euroc.detect(path) and not check_inertial.has_depth(path):
         return "EuRoC, IMU and ground truth without depth", check_inertial.check_inertial(path)
-    try:
-        form = rgbd_registry.find_format(path)
-    except DataError:
-        checked: Checked | None = check_trajectories(path)
-        if checked is None:
-            raise DataError(f"{path}: expected {_KNOWN}, got {found(path)}") from None
-        return "folder of trajectories", checked
-    return f"RGB-D recording ({form})", check_recording.check_recording(path, form)
+    form = rgbd_registry.detect(path)
+    if form is not None:
+        return f"RGB-D recording ({form})", check_recording.check_recording(path, form, topics)
+    checked: Checked | None = check_trajectories(path)
+    if checked is None:
+        raise DataError(f"{path}: expected {_KNOWN}, got {rgbd_registry.nearest(path)}")
+    return "folder of trajectories", checked

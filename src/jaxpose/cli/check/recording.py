@@ -4,6 +4,7 @@ Files of timestamps, camera, depth, ground truth, and what of it fits together.
 """
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -27,8 +28,8 @@ _ANGLES = (20.0, 150.0)  # degrees of view
 _OFF_CENTRE = 0.15  # of the width or height
 
 
-def check_recording(path: Path, form: rgbd_registry.Format) -> Checked:
-    """Everything that is tested of a recording in the layout `form`, images looked at here and there only."""
+def check_recording(path: Path, form: rgbd_registry.Format, topics: Sequence[str] = ()) -> Checked:
+    """Everything that is tested of a recording in the format `form`, images looked at here and there only."""
     parts = []
     for name in _STAMPS.get(form, ()):
         if (path / name).is_file() and (table := read_unchecked(path / name)).size:
@@ -37,10 +38,10 @@ def check_recording(path: Path, form: rgbd_registry.Format) -> Checked:
     if form == "euroc":
         parts.append(check_inertial(path))
     try:
-        recording = rgbd_registry.load_recording(path, form)
+        recording = rgbd_registry.load_recording(path, form, topics=topics)
         parts += [
             Checked(notes=recording.notes),
-            _frames(recording, _stamped(path, form)),
+            _frames(recording, rgbd_registry.has_timestamps(path, form)),
             check_camera(recording.camera),
         ]
         for test in (_depth, _truth, check_reprojection):
@@ -69,14 +70,6 @@ def check_camera(camera: Camera) -> Checked:
     else:
         finding = Finding("ok", "intrinsics", f"{angles[0]:.1f} x {angles[1]:.1f} deg, centred")
     return Checked((Fact("camera", text, numbers),), (finding,))
-
-
-def _stamped(path: Path, form: rgbd_registry.Format) -> bool:
-    """Whether the frames have timestamps of their own."""
-    if form != "plain":
-        return form in ("tum", "euroc")
-    poses = path / "poses.txt"
-    return (path / "times.txt").is_file() or (poses.is_file() and read_unchecked(poses).shape[1] == 8)
 
 
 def _frames(recording: Recording, stamped: bool) -> Checked:

@@ -2,6 +2,7 @@ from . import euroc as euroc
 from . import icl_nuim as icl_nuim
 from . import plain as plain
 from . import replica as replica
+from . import ros as ros
 from . import scannet as scannet
 from . import sevenscenes as sevenscenes
 from . import tum as tum

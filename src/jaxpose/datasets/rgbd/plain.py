@@ -57,6 +57,21 @@ def detect(path: Path) -> bool:
     return (path / "color").is_dir() or (path / "depth").is_dir()
 
 
+def has_timestamps(path: Path) -> bool:
+    """Whether a file of the folder states when each frame was taken.
+
+    Args:
+        path: The folder.
+
+    Returns:
+        True for a `times.txt`, and for poses of TUM's lines without one.
+    """
+    times, poses = path / "times.txt", path / "poses.txt"
+    if times.is_file() or not poses.is_file():
+        return times.is_file()
+    return next((len(line.split()) == 8 for _, line in numbered_lines(poses)), False)
+
+
 def load(path: Path | str, *, rate_hz: float = 30.0, depth_per_metre: float | None = None) -> Recording:
     """Read a plain folder: `color/` and `depth/` with png or jpg images, in the order of their numbers.
 

@@ -1,72 +1,135 @@
-"""Any recording: which of the layouts a folder has, by its files, and its loader."""
+"""Any recording: which of the formats a path has, by its content, and its loader."""
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from pathlib import Path
+from types import ModuleType
 from typing import Literal, NamedTuple, get_args
 
-from jaxpose.datasets.images import found
-from jaxpose.datasets.rgbd import euroc, icl_nuim, plain, replica, scannet, sevenscenes, tum
+from jaxpose.datasets.images import found, some
+from jaxpose.datasets.rgbd import euroc, icl_nuim, plain, replica, ros, scannet, sevenscenes, tum
 from jaxpose.datasets.types import Recording
 from jaxpose.errors import DataError
 
-Format = Literal["sevenscenes", "tum", "replica", "scannet", "euroc", "icl_nuim", "plain"]
+Format = Literal["ros", "sevenscenes", "tum", "replica", "scannet", "euroc", "icl_nuim", "plain"]
+_ARCHIVES = (".zip", ".tgz", ".gz", ".tar", ".7z", ".rar")
+_MOST_FOLDERS = 200  # looked into for recordings, where a path is none itself
 
 
-class _Layout(NamedTuple):
-    """What a layout looks like in words, whether a folder has it, and its loader."""
+class Layout(NamedTuple):
+    """A format: what it is called, what files it has, and its loader."""
 
-    files: str
-    detect: Callable[[Path], bool]
-    load: Callable[[Path | str, float], Recording]
+    title: str
+    files: tuple[str, ...]  # patterns of what it has to have, alternatives with |
+    module: ModuleType  # with `detect` and `load`
+    settings: tuple[str, ...]  # that `load` takes: without rate_hz the frames have timestamps
+    tested: str  # what its test reads
 
 
+_RATE = ("rate_hz",)
 # In the order in which they are tried: the plain folder has least of its own, so it is last.
-_LAYOUTS: dict[Format, _Layout] = {
-    "sevenscenes": _Layout(
-        "frame-NNNNNN.color.png and frame-NNNNNN.depth.png",
-        sevenscenes.detect,
-        lambda path, rate_hz: sevenscenes.load(path, rate_hz=rate_hz),
+LAYOUTS: dict[Format, Layout] = {
+    "ros": Layout(
+        "ROS 1 and ROS 2 bags (extra `ros`)",
+        ("*.bag|*.mcap|*.db3|metadata.yaml",),
+        ros,
+        ("topics",),
+        "bags that rosbags writes",
     ),
-    "tum": _Layout("rgb.txt and depth.txt", tum.detect, lambda path, rate_hz: tum.load(path)),
-    "replica": _Layout(
-        "results/ and traj.txt", replica.detect, lambda path, rate_hz: replica.load(path, rate_hz=rate_hz)
+    "sevenscenes": Layout(
+        "7-Scenes",
+        ("frame-*.color.png|frame-*.color.jpg", "frame-*.depth.png"),
+        sevenscenes,
+        _RATE,
+        "a made folder, RedKitchen",
     ),
-    "scannet": _Layout(
-        "color/, depth/ and pose/", scannet.detect, lambda path, rate_hz: scannet.load(path, rate_hz=rate_hz)
+    "tum": Layout("TUM RGB-D", ("rgb.txt", "depth.txt"), tum, (), "a made folder, fr1/rpy"),
+    "replica": Layout(
+        "Replica (NICE-SLAM's)", ("results/frame*", "results/depth*"), replica, _RATE, "a made folder"
     ),
-    "euroc": _Layout("mav0/cam0 and mav0/imu0", euroc.detect, lambda path, rate_hz: euroc.load(path)),
-    "icl_nuim": _Layout(
-        "associations.txt, depth/ and rgb/",
-        icl_nuim.detect,
-        lambda path, rate_hz: icl_nuim.load(path, rate_hz=rate_hz),
+    "scannet": Layout(
+        "ScanNet", ("color/*|frames/color/*", "depth/*|frames/depth/*", "pose|frames/pose"), scannet, _RATE,
+        "a made folder",
     ),
-    "plain": _Layout(
-        "color/, depth/ and intrinsics",
-        plain.detect,
-        lambda path, rate_hz: plain.load(path, rate_hz=rate_hz),
+    "euroc": Layout(
+        "EuRoC with depth or a scan",
+        ("mav0/cam0|cam0", "mav0/imu0|imu0", "mav0/depth0|depth0|mav0/pointcloud0|data.ply"),
+        euroc,
+        (),
+        "a made folder, V1_01",
     ),
-}
+    "icl_nuim": Layout(
+        "ICL-NUIM", ("associations.txt", "rgb/*", "depth/*"), icl_nuim, _RATE, "a made folder, kt3"
+    ),
+    "plain": Layout(
+        "a plain folder",
+        ("color/*", "depth/*", "camera-intrinsics.txt|intrinsics.json"),
+        plain,
+        _RATE,
+        "a made folder",
+    ),
+}  # fmt: skip
 
 
 def find_format(path: Path | str) -> Format:
-    """The layout of a folder, by its files.
+    """The format of a recording, by its content.
 
     Args:
-        path: The folder.
+        path: Its folder or file.
 
     Returns:
-        The name of the layout.
+        The name of the format.
 
     Raises:
-        DataError: Saying what was expected and what is there.
+        DataError: Naming the formats, and what is there, as `nearest` says.
+    """
+    if (name := detect(path)) is not None:
+        return name
+    titles = ", ".join(layout.title for layout in LAYOUTS.values())
+    raise DataError(f"{path}: expected a recording ({titles}), got {nearest(path)}")
+
+
+def detect(path: Path | str) -> Format | None:
+    """The format of a recording, by its content.
+
+    Args:
+        path: A folder or file.
+
+    Returns:
+        The name of the format; None for what is no recording.
     """
     path = Path(path)
-    if path.is_dir():
+    if path.is_dir() or path.is_file():
         for name in get_args(Format):
-            if _LAYOUTS[name].detect(path):
+            if LAYOUTS[name].module.detect(path):
                 return name
-    expected = ", or ".join(f"{layout.files} ({name})" for name, layout in _LAYOUTS.items())
-    raise DataError(f"{path}: expected a folder of {expected}, got {found(path)}")
+    return None
+
+
+def nearest(path: Path | str) -> str:
+    """What is at a path that is no recording, for a message of one line.
+
+    Args:
+        path: A folder or file, or nothing.
+
+    Returns:
+        What is there; the recordings in it, or else the nearest format and what it lacks.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        return found(path) + (" to be unpacked first" if path.suffix in _ARCHIVES and path.is_file() else "")
+    if inner := _recordings_in(path):
+        return f"a folder of recordings, name one: {some(inner)}"
+    ranked = []
+    for layout_name, layout in LAYOUTS.items():
+        there = [_match(path, part) for part in layout.files]
+        ranked.append((sum(there) / len(there), sum(there), layout_name, there))
+    share, _, name, there = max(ranked, key=lambda row: row[:2])
+    if not share:
+        return found(path)
+    layout = LAYOUTS[name]
+    lacking = [words(part) for part, is_there in zip(layout.files, there, strict=True) if not is_there]
+    without = f", without {' and '.join(lacking)}" if lacking else ""
+    return f"{found(path)}: the nearest is {layout.title} ({name}){without}"
 
 
 def has_timestamps(path: Path | str, format: Format) -> bool:
@@ -74,27 +137,27 @@ def has_timestamps(path: Path | str, format: Format) -> bool:
 
     Args:
         path: its folder.
-        format: its layout.
+        format: its format.
 
     Returns:
         True where the files state when each frame was taken.
     """
-    if format != "plain":
-        return format in ("tum", "euroc")
-    folder = Path(path)
-    if (folder / "times.txt").is_file() or not (folder / "poses.txt").is_file():
-        return (folder / "times.txt").is_file()
-    lines = (line for line in (folder / "poses.txt").read_text("utf-8").splitlines() if line.strip())
-    return next((len(line.split()) == 8 for line in lines if not line.startswith("#")), False)
+    layout = LAYOUTS[format]
+    if hasattr(layout.module, "has_timestamps"):
+        return layout.module.has_timestamps(Path(path))
+    return "rate_hz" not in layout.settings
 
 
-def load_recording(path: Path | str, format: Format | None = None, *, rate_hz: float = 30.0) -> Recording:
-    """Read an RGB-D recording in any of the layouts.
+def load_recording(
+    path: Path | str, format: Format | None = None, *, rate_hz: float = 30.0, topics: Sequence[str] = ()
+) -> Recording:
+    """Read an RGB-D recording in any of the formats.
 
     Args:
-        path: The folder.
-        format: The layout; by default the one that `find_format` finds.
-        rate_hz: Frames a second where a layout has no timestamps.
+        path: The folder or file.
+        format: The format; by default the one that `find_format` finds.
+        rate_hz: Frames a second where a format has no timestamps.
+        topics: Of a ROS bag, those to use before others of their kind.
 
     Returns:
         The recording; images are read when asked for.
@@ -103,4 +166,25 @@ def load_recording(path: Path | str, format: Format | None = None, *, rate_hz: f
         DataError: Naming the file for anything that cannot be used.
         ValueError: For a rate that is not positive.
     """
-    return _LAYOUTS[format or find_format(path)].load(path, rate_hz)
+    format = format or find_format(path)
+    layout = LAYOUTS[format]
+    if topics and "topics" not in layout.settings:
+        raise DataError(f"{path}: expected a ROS bag to choose topics of, got {layout.title}")
+    given = {"rate_hz": rate_hz, "topics": topics}
+    return layout.module.load(path, **{name: given[name] for name in layout.settings})
+
+
+def words(part: str) -> str:
+    """A pattern of `Layout.files` in words."""
+    return part.replace("|", " or ")
+
+
+def _match(path: Path, part: str) -> bool:
+    return any(next(iter(path.glob(pattern)), None) is not None for pattern in part.split("|"))
+
+
+def _recordings_in(path: Path) -> list[str]:
+    """Names and formats of the recordings in a folder."""
+    inner = [folder for folder in sorted(path.iterdir()) if not folder.name.startswith(".")]
+    formats = [(folder.name, detect(folder)) for folder in inner[:_MOST_FOLDERS]]
+    return [f"{name} ({form})" for name, form in formats if form is not None]

@@ -53,7 +53,8 @@ def detect(path: Path) -> bool:
     Returns:
         Whether `load` should read it.
     """
-    return any(_FRAME.fullmatch(file.name) or file.match("seq-*") for file in path.iterdir())
+    files = path.iterdir() if path.is_dir() else ()
+    return any(_FRAME.fullmatch(file.name) or file.match("seq-*") for file in files)
 
 
 def load(path: Path | str, *, rate_hz: float = 30.0) -> Recording:

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from jaxpose.datasets.images import (
     INTRINSICS,
@@ -20,10 +20,10 @@ from jaxpose.datasets.images import (
     read_depth,
     read_intrinsics,
     sidecar,
-    some,
     usable_poses,
     within,
 )
+from jaxpose.datasets.rgbd.pairs import nearest_pairs, unpaired_note
 from jaxpose.datasets.types import Accelerometer, Frame, Recording
 from jaxpose.errors import DataError
 from jaxpose.files.tables import numbered_lines, read_numbers, read_stamped_names, seconds
@@ -98,7 +98,7 @@ def load(path: Path | str, *, max_difference_s: float = 0.02, depth_per_metre: f
     if not folder.is_dir():
         raise DataError(f"{folder}: expected a folder with rgb.txt and depth.txt, got {found(folder)}")
     color, depth = read_list(folder / "rgb.txt"), read_list(folder / "depth.txt")
-    rows, partners = _pairs(folder, color.t, depth.t, max_difference_s)
+    rows, partners = nearest_pairs(str(folder), color.t, depth.t, max_difference_s)
     ns = [color.ns[row] for row in rows]
     t, t0_ns = seconds(ns, ns[0]), ns[0]
     colors, depths = [color.files[i] for i in rows], [depth.files[i] for i in partners]
@@ -107,8 +107,12 @@ def load(path: Path | str, *, max_difference_s: float = 0.02, depth_per_metre: f
     check_depth(folder, depths, depth_per_metre)
     read_color(colors[0])
     poses, lacking = _truth(folder / "groundtruth.txt", color.t[rows], max_difference_s)
-    notes = [*_alone("colour", "depth", color, rows, max_difference_s)]
-    notes += [*_alone("depth", "colour", depth, partners, max_difference_s), *assumed, *lacking]
+    notes = [*unpaired_note("colour", "depth", _names(color), rows, max_difference_s)]
+    notes += [
+        *unpaired_note("depth", "colour", _names(depth), partners, max_difference_s),
+        *assumed,
+        *lacking,
+    ]
     accelerometer, weighed = _accelerometer(folder / "accelerometer.txt", t0_ns, t, poses)
     return Recording(
         name=name_of(folder),
@@ -141,39 +145,8 @@ def read_list(file: Path) -> Stamped:
     return Stamped(ns, [file.parent / name for name in names])
 
 
-def _pairs(
-    folder: Path, t: Float[np.ndarray, " n"], other: Float[np.ndarray, " m"], limit: float
-) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
-    """Indices of timestamps less than `limit` apart, each used once, the closest pairs first."""
-    first, last = np.searchsorted(other, t - limit), np.searchsorted(other, t + limit)
-    near = sorted((abs(t[i] - other[j]), i, j) for i in range(len(t)) for j in range(first[i], last[i]))
-    partner: dict[int, int] = {}
-    taken: set[int] = set()
-    for difference, i, j in near:
-        if difference < limit and i not in partner and j not in taken:
-            partner[i] = j
-            taken.add(j)
-    if not partner:
-        spans = [f"{x[0]:.3f} to {x[-1]:.3f} s" for x in (t, other)]
-        raise DataError(
-            f"{folder}: expected colour and depth within {limit:g} s, "
-            f"got timestamps from {' and '.join(spans)}"
-        )
-    rows = sorted(partner)
-    return np.array(rows), np.array([partner[i] for i in rows])
-
-
-def _alone(
-    kind: str, other: str, images: Stamped, used: Int[np.ndarray, " k"], limit: float
-) -> tuple[str, ...]:
-    """A note on images that found no partner."""
-    alone = [images.files[i].name for i in np.setdiff1d(np.arange(len(images.t)), used)]
-    if not alone:
-        return ()
-    note = (
-        f"{len(alone)} of {len(images.t)} {kind} images left out, no {other} of their own within {limit:g} s"
-    )
-    return (f"{note}: {some(alone)}",)
+def _names(images: Stamped) -> list[str]:
+    return [file.name for file in images.files]
 
 
 def _camera(folder: Path, size: tuple[int, int]) -> tuple[Pinhole, tuple[float, ...], tuple[str, ...]]:

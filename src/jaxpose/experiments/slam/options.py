@@ -58,6 +58,7 @@ class Options:
 
     data: Path | None = None  # folder of a recording; None: a synthetic room is made on the fly
     format: rgbd_registry.Format | None = None  # layout of --data; None: found by its files
+    topics: tuple[str, ...] = ()  # of a ROS bag in --data, those to use before others of their kind
     recorded_hz: float | None = None  # [Hz] frame rate of --data where it has no timestamps; None: 30
     rate_hz: float | None = None  # [Hz] frames are thinned to this; None: the room's 5, or all frames
     start: int = 0  # first frame used, counted before thinning
@@ -91,7 +92,7 @@ class Options:
 
     def _check_data(self):
         if self.data is None:
-            check_unused(self, ("format", "recorded_hz"), "without --data")
+            check_unused(self, ("format", "topics", "recorded_hz"), "without --data")
         else:
             check_unused(self, [f"room.{name}" for name in RoomConfig.__dataclass_fields__], "with --data")
         if self.room.along is not None:

@@ -8,7 +8,7 @@ import numpy as np
 from jaxpose.datasets.rgbd import registry as rgbd_registry
 from jaxpose.datasets.rgbd.imu_csv import imu_notes, with_imu
 from jaxpose.datasets.synthetic import room
-from jaxpose.datasets.types import Recording, select, thin
+from jaxpose.datasets.types import Recording, prefetch, select, thin
 from jaxpose.errors import DataError
 from jaxpose.experiments.slam.options import FEWEST_FRAMES, SMOKE_FRAMES, Options, room_config
 from jaxpose.geometry import rigid
@@ -54,7 +54,7 @@ def load(options: Options) -> Source:
         if options.recorded_hz is not None and rgbd_registry.has_timestamps(options.data, name):
             raise DataError(f"{options.data}: expected no --recorded-hz, as its frames have timestamps")
         recording = rgbd_registry.load_recording(
-            options.data, name, rate_hz=options.recorded_hz or _RECORDED_HZ
+            options.data, name, rate_hz=options.recorded_hz or _RECORDED_HZ, topics=options.topics
         )
         if options.imu_file is not None and options.imu_extrinsics is not None:
             recording = with_imu(recording, options.imu_file, options.imu_extrinsics)
@@ -87,7 +87,7 @@ def load(options: Options) -> Source:
         "rate_hz": 1 / float(np.median(np.diff(recording.t))),
         "size": (recording.camera.width, recording.camera.height),
     }
-    return Source(recording, metadata, imu)
+    return Source(prefetch(recording), metadata, imu)
 
 
 def _sheet(noise: ImuNoise) -> str:

@@ -1,0 +1,146 @@
+"""The cameras of a bag: CameraInfo as a `Camera`, and how colour and depth are brought to one."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxpose.datasets.rgbd.registration import register_depth
+from jaxpose.datasets.rgbd.ros_bag import Bag
+from jaxpose.datasets.rgbd.ros_frames import Tree
+from jaxpose.datasets.rgbd.ros_topics import ImageTopic, camera_topic
+from jaxpose.datasets.types import Frame
+from jaxpose.errors import DataError
+from jaxpose.geometry.camera import Camera, resized
+
+_SAME_SHAPE = 0.02  # of width by height, for images of the same view in two sizes
+_BROWN = ("plumb_bob", "radtan", "brown_conrady", "inverse_brown_conrady", "none", "")
+_RATIONAL = "rational_polynomial"
+
+
+class View(NamedTuple):
+    """The camera of a recording, and how a colour and a depth image [m] become its frame."""
+
+    camera: Camera
+    frame: Callable[[np.ndarray, np.ndarray], Frame]
+    notes: tuple[str, ...]
+
+
+class _Lens(NamedTuple):
+    """The camera of a topic, and OpenCV's maps where its images have to be undistorted for it."""
+
+    camera: Camera
+    maps: tuple[np.ndarray, np.ndarray] | None  # column and row [px] to take each pixel from
+    notes: tuple[str, ...]
+
+
+def common_view(bag: Bag, tree: Tree, color: ImageTopic, depth: ImageTopic) -> View:
+    """The camera that colour and depth are of, or are brought to.
+
+    Args:
+        bag: An open bag.
+        tree: Its frames of reference.
+        color: The topic of colour.
+        depth: The topic of depth, in colour's frame of reference or in another.
+
+    Returns:
+        The camera of colour: of depth's size, where depth is smaller.
+
+    Raises:
+        DataError: Without CameraInfo, for a lens that cannot be used, and for depth that is not registered
+            and cannot be.
+    """
+    info = camera_topic(bag, color) or (camera_topic(bag, depth) if depth.frame == color.frame else None)
+    if info is None:
+        raise DataError(f"{bag.path}: expected a CameraInfo of {color.topic.name}, got none")
+    lens = _lens(bag, info, color)
+    (width, height), (w, h) = color.kind.size, depth.kind.size
+    if depth.frame != color.frame or abs(width / height / (w / h) - 1) > _SAME_SHAPE:
+        return _registered(bag, tree, color, depth, lens)
+    if (w, h) == (width, height):
+        if lens.maps is None:
+            return View(lens.camera, Frame, lens.notes)
+        maps = lens.maps
+        return View(lens.camera, lambda rgb, z: Frame(_remap(rgb, maps), _remap(z, maps)), lens.notes)
+    if lens.maps is not None:
+        raise DataError(
+            f"{bag.path}: {info}: expected {_BROWN[0]} with depth of another size, got {_RATIONAL}"
+        )
+    note = f"colour resized from {width}x{height} to {w}x{h}, the size of depth"
+    camera = resized(lens.camera, w, h)
+    return View(camera, lambda rgb, z: Frame(_resized(rgb, camera), z), (*lens.notes, note))
+
+
+def _registered(bag: Bag, tree: Tree, color: ImageTopic, depth: ImageTopic, lens: _Lens) -> View:
+    """Depth of a camera of its own, registered to colour."""
+    (width, height), (w, h) = color.kind.size, depth.kind.size
+    other, T_color_depth = camera_topic(bag, depth), tree.static(color.frame, depth.frame)
+    if other is None or T_color_depth is None:
+        got = f"{w}x{h} of {depth.frame!r} beside {width}x{height} of {color.frame!r}"
+        lacking = "CameraInfo of depth" if other is None else "transform in /tf_static"
+        raise DataError(
+            f"{bag.path}: expected depth registered to colour, or what registers it, got {got}, no {lacking}"
+        )
+    of_depth = _lens(bag, other, depth)
+    if of_depth.maps is not None:
+        raise DataError(f"{bag.path}: {other}: expected a lens of {_BROWN[0]} for depth, got {_RATIONAL}")
+    camera = lens.camera
+    if width > 1.5 * w:  # else most pixels of colour would stay without depth
+        camera = resized(camera, w, round(w * height / width))
+    register = register_depth(of_depth.camera, camera, T_color_depth)
+    color_of = lambda rgb: _resized(rgb if lens.maps is None else _remap(rgb, lens.maps), camera)
+    note = f"depth of {depth.frame} ({w}x{h}) registered to {color.frame}"
+    note += f", colour resized to {camera.width}x{camera.height}" if camera.width != width else ""
+    return View(camera, lambda rgb, z: Frame(color_of(rgb), register(z)), (*lens.notes, note))
+
+
+def _lens(bag: Bag, topic: str, image: ImageTopic) -> _Lens:
+    """The camera of a CameraInfo, of the size of its images."""
+    import cv2
+
+    info, (width, height) = bag.first(topic), image.kind.size
+    K, D, P = (np.array(_either(info, name), np.float64) for name in "KDP")
+    model, where = str(info.distortion_model), f"{bag.path}: {topic}"
+    if "rect" in image.topic.name.rsplit("/", 2)[-1] + image.topic.name.rsplit("/", 2)[-2]:
+        K, D = P.reshape(3, 4)[:, :3], np.zeros(0)
+    K = K.reshape(3, 3)
+    if not (np.isfinite(K).all() and K[0, 0] > 0 and K[1, 1] > 0 and np.isfinite(D).all()):
+        raise DataError(f"{where}: expected positive focal lengths, got {K[0, 0]:g} and {K[1, 1]:g}")
+    if D.any() and model not in (*_BROWN, _RATIONAL):
+        known = ", ".join((_BROWN[0], _RATIONAL))
+        raise DataError(f"{where}: expected a distortion_model of {known}, got {model!r}: rectify its images")
+    size = (int(info.width) or width, int(info.height) or height)
+    lens = tuple(float(d) for d in (*D[:5], *[0.0] * 5)[:5]) if D.any() else ()
+    fx, fy, cx, cy = (float(x) for x in K[[0, 1, 0, 1], [0, 1, 2, 2]])
+    camera = resized(Camera(fx, fy, cx, cy, size[0], size[1], lens), width, height)
+    note = (
+        (f"{topic} is of {size[0]}x{size[1]}, scaled to {width}x{height}",) if size != (width, height) else ()
+    )
+    if not D[5:].any():
+        return _Lens(camera, None, note)
+    K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    maps = cv2.initUndistortRectifyMap(K, D, np.eye(3), K, (width, height), cv2.CV_32FC1)
+    undone = f"{topic}: the lens of {model} is undone in the images, which are a pinhole's"
+    return _Lens(camera._replace(distortion=()), (maps[0], maps[1]), (*note, undone))
+
+
+def _either(message: Any, name: str) -> Any:
+    """A field whose name is upper case in ROS 1 and lower case in ROS 2."""
+    return getattr(message, name) if hasattr(message, name) else getattr(message, name.lower())
+
+
+def _remap(image: np.ndarray, maps: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """Colour is interpolated, depth is not."""
+    import cv2
+
+    how = cv2.INTER_LINEAR if image.ndim == 3 else cv2.INTER_NEAREST
+    return np.asarray(cv2.remap(image, *maps, how))
+
+
+def _resized(rgb: np.ndarray, camera: Camera) -> np.ndarray:
+    import cv2
+
+    size = (camera.width, camera.height)
+    return (
+        rgb if rgb.shape[1::-1] == size else np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA))
+    )
