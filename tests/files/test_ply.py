@@ -61,6 +61,14 @@ TEXT = header("ascii", "float")
         (TEXT + b"7 1 2 3 4\n", r": expected 3 vertices, got 1"),
         (TEXT + b"7 1 2 3 4\n7 1 two 3 4\n", r": expected 3 lines of numbers below line 12, got .*two"),
         (header("binary_little_endian", "float") + bytes(20), r": expected 3 vertices, got 1"),
+        (header("binary_little_endian", "float", 10**13), r": expected 10000000000000 vertices, got 0"),
+        (TEXT.replace(b"float y\n", b"float x\n"), r": expected vertices with x y z, got no y"),
+        (
+            header("binary_little_endian", "float").replace(b"uchar red\n", b"float x\n"),
+            r": expected a PLY file, got field 'x' occurs more than once",
+        ),
+        (TEXT + b"7 1 nan 3 4\n" * 3, r": expected points up to 1e\+09 m away, got .* nan"),
+        (TEXT + b"7 1 2e9 3 4\n" * 3, r": expected points up to 1e\+09 m away, got"),
     ],
 )
 def test_damaged_files_are_named(tmp_path, content, message):

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from jaxpose._checks import check_shapes
 from jaxpose.errors import DataError
 from jaxpose.files.atomic import atomic
+from jaxpose.files.schema import FARTHEST_M
 from jaxpose.geometry import rigid
 from jaxpose.geometry.camera import Camera
 
@@ -107,13 +108,16 @@ def read_colmap(folder: Path | str) -> ColmapModel:
         if camera not in cameras:
             raise DataError(f"{files[1]}: expected a camera of {files[0].name} for {name}, got {camera}")
     rows = {number: row for row, (number, *_) in enumerate(points)}
+    xyz = np.array([xyz for _, xyz, _ in points], np.float64).reshape(-1, 3)
+    for row in np.flatnonzero(~(np.abs(xyz) <= FARTHEST_M).all(1)):
+        raise DataError(f"{files[2]}: expected points up to {FARTHEST_M:g} away, got {xyz[row]}")
     seen = tuple(np.array([rows[k] for k in ids if k in rows], np.int64) for ids in matched)
     return ColmapModel(
         cameras,
         names,
         camera_ids,
         _poses(files[1], names, np.array(wxyz), np.array(translation)),
-        np.array([xyz for _, xyz, _ in points], np.float64).reshape(-1, 3),
+        xyz,
         np.array([rgb for *_, rgb in points], np.uint8).reshape(-1, 3),
         seen,
     )
@@ -199,7 +203,7 @@ def _poses(
     norm = np.linalg.norm(wxyz, axis=1)
     for row in np.flatnonzero(~((np.abs(norm - 1) < 1e-2) & np.isfinite(translation).all(1))):
         got = " ".join(f"{number:g}" for number in (*wxyz[row], *translation[row]))
-        raise DataError(f"{file}: expected a unit quaternion and a position for {names[row]}, got {got}")
+        raise DataError(f"{file}: expected a unit quaternion and a position for {names[int(row)]}, got {got}")
     rotation = Rotation.from_quat(wxyz, scalar_first=True).as_matrix()
     return rigid.inverse(rigid.make(rotation, translation))
 
@@ -300,7 +304,9 @@ def _text_points(file: Path) -> Iterator[tuple[int, Any, Any]]:
         if line.strip():
             number, *xyz_rgb = line.split()[:7]
             numbers = [float(word) for word in xyz_rgb]
-            yield int(number), numbers[:3], numbers[3:6]
+            if len(numbers) != 6 or not all(0 <= channel <= 255 for channel in numbers[3:]):
+                raise ValueError(f"{line[:60]!r}, not a number, x y z and r g b to 255")
+            yield int(number), numbers[:3], numbers[3:]
 
 
 def _text_content(

@@ -9,6 +9,8 @@ from jaxtyping import Float, Int, UInt8
 from jaxpose._checks import check_shapes
 from jaxpose.errors import DataError
 from jaxpose.files.atomic import atomic
+from jaxpose.files.schema import FARTHEST_M
+from jaxpose.files.untrusted import reading
 
 _TYPES = {
     **{"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1"},
@@ -33,7 +35,7 @@ def read_points(path: Path | str) -> Float[np.ndarray, "n 3"]:
         DataError: Naming the file (and the line of a header or text) for what cannot be read.
     """
     path = Path(path)
-    with path.open("rb") as stream:
+    with path.open("rb") as stream, reading(path, "a PLY file"):
         form, count, properties, lines = _header(path, stream)
         names = [name for name, _ in properties]
         missing = [axis for axis in "xyz" if axis not in names]
@@ -43,10 +45,11 @@ def read_points(path: Path | str) -> Float[np.ndarray, "n 3"]:
         if form == "ascii":
             return _text(path, stream, count, [names.index(axis) for axis in "xyz"], lines)
         kind = np.dtype([(name, _ORDERS[form] + code) for name, code in properties])
+        there = (path.stat().st_size - stream.tell()) // kind.itemsize
+        if there < count:
+            raise DataError(f"{path}: expected {count} vertices, got {there}")
         vertices = np.fromfile(stream, kind, count)
-    if len(vertices) != count:
-        raise DataError(f"{path}: expected {count} vertices, got {len(vertices)}")
-    return np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
+        return _finite(path, np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1))
 
 
 def write_ply(
@@ -141,4 +144,11 @@ def _text(
         ) from None
     if len(points) != count:
         raise DataError(f"{path}: expected {count} vertices, got {len(points)}")
+    return _finite(path, points)
+
+
+def _finite(path: Path, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """The points; DataError for NaN, infinity and what is too far."""
+    for row in np.flatnonzero(~(np.abs(points) <= FARTHEST_M).all(1)):
+        raise DataError(f"{path}: expected points up to {FARTHEST_M:g} m away, got {points[row]}")
     return points

@@ -6,7 +6,7 @@ from typing import NamedTuple, get_args
 import numpy as np
 from jaxtyping import Float
 
-from jaxpose.datasets.events.stream import Stream, Unit, inside, seconds
+from jaxpose.datasets.events.stream import Stream, Unit, check_numbers, inside, seconds
 from jaxpose.datasets.events.validate import clean
 from jaxpose.datasets.images import check_intrinsics, name_of
 from jaxpose.datasets.types import EventRecording
@@ -108,6 +108,7 @@ def _guess_size(stream: Stream, centre: tuple[float, float] | None) -> tuple[int
     block = next((block for block in stream.blocks() if len(block.t)), None)
     if block is None:
         raise DataError(f"{stream.file}: expected events, got none")
+    check_numbers(stream, block, 0)
     for size in _SENSORS:
         off = [abs((c + 0.5) / s - 0.5) for c, s in zip(centre or (), size, strict=False)]
         if inside(block, size).mean() >= _HELD and max(off, default=0.0) <= _OFF_CENTRE:

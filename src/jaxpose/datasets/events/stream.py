@@ -61,7 +61,7 @@ def stream_stats(
     for block in stream.blocks():
         if not len(block.t):
             continue
-        _check_numbers(stream, block, seen)
+        check_numbers(stream, block, seen)
         block = block._replace(t=block.t.astype(np.float64 if block.t.dtype.kind == "f" else np.int64))
         if stats is None:
             first = zero if zero is not None else block.t[0].item()
@@ -158,7 +158,7 @@ def _add(stats: StreamStats, block: Block, size: tuple[int, int], seen: int) -> 
     )
 
 
-def _check_numbers(stream: Stream, block: Block, seen: int) -> None:
+def check_numbers(stream: Stream, block: Block, seen: int) -> None:
     """Refuse other things than numbers, NaN and infinity, and pixels between pixels."""
     for name, values in block._asdict().items():
         if values.dtype.kind not in ("iuf" if name == "t" else "biuf"):

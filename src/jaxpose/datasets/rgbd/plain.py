@@ -1,6 +1,5 @@
 """A plain folder: images in `color/` and `depth/`, intrinsics, and optional `poses.txt` and `times.txt`."""
 
-import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -31,8 +30,10 @@ from jaxpose.datasets.images import (
 )
 from jaxpose.datasets.types import Frame, Recording
 from jaxpose.errors import DataError
+from jaxpose.files.schema import numbers
 from jaxpose.files.tables import numbered_lines, read_numbers, read_stamped, seconds
 from jaxpose.files.trajectories import nearest, read_kitti, read_tum
+from jaxpose.files.untrusted import read_json
 from jaxpose.geometry.camera import Camera
 
 _JSON = "intrinsics.json"
@@ -167,16 +168,11 @@ def _intrinsics(folder: Path, size: tuple[int, int]) -> _Stated:
         return _Stated(read_intrinsics(file, size), None)
     if (file := sidecar(folder, _JSON)) is None:
         raise DataError(f"{folder}: expected {INTRINSICS} or {_JSON} in it or one folder up, got neither")
-    try:
-        values = json.loads(file.read_text("utf-8-sig"))
-        fx, fy, cx, cy = (float(values[key]) for key in ("fx", "fy", "cx", "cy"))
-        stated = (float(values.get("width", size[0])), float(values.get("height", size[1])))
-        per_metre = float(values["depth_scale"]) if "depth_scale" in values else None
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise DataError(
-            f"{file}: expected numbers fx fy cx cy [width height depth_scale], "
-            f"got {type(error).__name__} {error}"
-        ) from None
+    values = read_json(file, "intrinsics")
+    number = lambda key: float(numbers(file, values, key))
+    fx, fy, cx, cy = map(number, ("fx", "fy", "cx", "cy"))
+    stated = tuple(number(k) if k in values else v for k, v in zip(("width", "height"), size, strict=True))
+    per_metre = number("depth_scale") if "depth_scale" in values else None
     if stated != size:
         raise DataError(
             f"{file}: expected the size of the images, {size[0]}x{size[1]}, got {stated[0]:g}x{stated[1]:g}"

@@ -1,6 +1,5 @@
 """Replica as NICE-SLAM renders it: `results/frameNNNNNN.jpg`, `results/depthNNNNNN.png` and `traj.txt`."""
 
-import json
 import math
 import re
 from pathlib import Path
@@ -27,7 +26,9 @@ from jaxpose.datasets.images import (
 )
 from jaxpose.datasets.types import Frame, Recording
 from jaxpose.errors import DataError
+from jaxpose.files import schema
 from jaxpose.files.tables import read_numbers
+from jaxpose.files.untrusted import read_json
 from jaxpose.geometry.camera import Camera
 
 _IMAGE = re.compile(r"(frame|depth)(\d+)\.(jpg|jpeg|png)")
@@ -119,15 +120,10 @@ def _read_parameters(folder: Path, size: tuple[int, int]) -> _Parameters:
     if file is None:
         note = default_intrinsics(_PUBLISHED, size, _PUBLISHED_SIZE, _PARAMETERS)
         return _Parameters(_PUBLISHED, _PER_METRE, (f"{note}, and {_PER_METRE} depth counts per metre",))
-    try:
-        values = json.loads(file.read_text("utf-8-sig"))["camera"]
-        width, height, fx, fy, cx, cy = (float(values[key]) for key in ("w", "h", "fx", "fy", "cx", "cy"))
-        per_metre = float(values.get("scale", _PER_METRE))
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise DataError(
-            f"{file}: expected camera with numbers w h fx fy cx cy [scale], "
-            f"got {type(error).__name__} {error}"
-        ) from None
+    values = read_json(file, "the camera of the recording").get("camera", {})
+    number = lambda key: float(schema.numbers(file, values, key))
+    width, height, fx, fy, cx, cy = map(number, ("w", "h", "fx", "fy", "cx", "cy"))
+    per_metre = number("scale") if "scale" in values else _PER_METRE
     if (width, height) != size:
         raise DataError(
             f"{file}: expected the size of the images, {size[0]}x{size[1]}, got {width:g}x{height:g}"
