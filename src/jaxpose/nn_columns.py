@@ -21,14 +21,14 @@ Precision = Literal["default", "high", "highest"]
 
 
 def dense(
-    layer: Mapping[str, Float[Array, "..."]], x: Float[Array, " i"], *, precision: Precision = "default"
+    layer: Mapping[str, Float[Array, "..."]], x: Float[Array, " i"], *, precision: Precision | None = None
 ) -> Float[Array, " o"]:
-    """A linear layer `{"kernel": (i, o), "bias": (o,)}` at one point."""
+    """A linear layer `{"kernel": (i, o), "bias": (o,)}` at one point; None: by JAX's setting."""
     return product(layer["kernel"], x, precision=precision) + spread(layer["bias"], x)
 
 
 def product(
-    kernel: Float[Array, "i o"], x: Float[Array, " i"], *, precision: Precision = "default"
+    kernel: Float[Array, "i o"], x: Float[Array, " i"], *, precision: Precision | None = None
 ) -> Float[Array, " o"]:
     """`x @ kernel` at one point."""
     if _product is None:

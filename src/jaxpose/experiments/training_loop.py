@@ -14,7 +14,9 @@ from jaxtyping import Float
 
 from jaxpose.errors import DataError
 from jaxpose.evaluation import trajectory_error
+from jaxpose.experiments import devices
 from jaxpose.experiments.checks import own_folder
+from jaxpose.experiments.devices import Job
 from jaxpose.experiments.outcome import Outcome, cost
 from jaxpose.experiments.progress import OnUpdate, Update
 from jaxpose.fields import PoseField, set_progress
@@ -78,9 +80,11 @@ def train(
     checkpoint: Path,
     on_update: OnUpdate,
     *,
+    job: Job,
+    precision: devices.Precision,
     label: str,
     describe: Callable[[float, float, float], Mapping[str, str]],
-    between: Callable[[State], State] = lambda state: state,
+    between: Callable[[State], State] | None = None,
 ) -> Trained:
     """Train to the end, from the checkpoint if there is one, and keep one as it goes.
 
@@ -89,40 +93,50 @@ def train(
         trained: where it starts.
         data: what the trainer takes.
         errors: rotation [deg] and translation error of the pose field's parameters.
-        checkpoint: the file of it.
+        checkpoint: the file of it, which process 0 reads and writes.
         on_update: called after every chunk of steps.
+        job: the devices that rays are spread over.
+        precision: of the products of the scene's networks.
         label: of this run among others; empty: it is the only one.
         describe: loss, rotation and translation error in words.
         between: changes the state after every chunk.
 
     Returns:
-        Where the training ended.
+        Where the training ended, on one device.
 
     Raises:
-        DataError: where the loss is no longer a number.
+        DataError: where the loss is no longer a number, where a step does not fit the device, and where
+            another process is lost.
     """
-    if checkpoint.exists():
-        trained = checkpoint_file.load(checkpoint, trained)
-    state, history = trained.state, trained.history.copy()
-    done = int(state.step) // CHUNK
-    before = history[done - 1, -1] if done else 0.0
-    started = saved = time.perf_counter()
     phase = " ".join(("training", label)).strip()
     on_update(Update(f"compiling the {phase}"))
-    for chunk in range(done, len(history)):
-        state, losses = model.trainer.advance(state, data, CHUNK)
-        state = between(state)
-        step, loss = (chunk + 1) * CHUNK, float(losses.mean())
-        if not np.isfinite(loss):
-            raise DataError(f"step {step}: expected a finite loss, got {loss}")
-        found = errors(state.pose)
-        now = time.perf_counter()
-        history[chunk] = (step, loss, *found, before + now - started)
-        if now - saved > _SAVE_EVERY_S or chunk + 1 == len(history):
-            checkpoint_file.save(checkpoint, Trained(state, history))
-            saved = now
-        on_update(Update(phase, step, model.train.steps, state=describe(loss, *found)))
-    return Trained(state, history)
+    if job.writes and checkpoint.exists():
+        trained = checkpoint_file.load(checkpoint, trained)
+    started = time.perf_counter()
+    with devices.guarded(job):
+        state = devices.on_all(job, devices.from_first(job, trained.state))
+        data, history = devices.on_all(job, data), trained.history.copy()
+        with devices.spread_over(job, precision):
+            advance = model.trainer.advance.lower(state, data, CHUNK).compile()
+        devices.check_memory(advance)
+        done = int(state.step) // CHUNK
+        before = history[done - 1, -1] if done else 0.0
+        saved = time.perf_counter()
+        for chunk in range(done, len(history)):
+            state, losses = advance(state, data)
+            if between is not None:
+                state = devices.on_all(job, between(devices.on_one(state)))
+            step, loss = (chunk + 1) * CHUNK, float(devices.on_one(losses).mean())
+            if not np.isfinite(loss):
+                raise DataError(f"step {step}: expected a finite loss, got {loss}")
+            found = errors(devices.on_one(state.pose))
+            now = time.perf_counter()
+            history[chunk] = (step, loss, *found, before + now - started)
+            if job.writes and (now - saved > _SAVE_EVERY_S or chunk + 1 == len(history)):
+                checkpoint_file.save(checkpoint, Trained(devices.on_one(state), history))
+                saved = now
+            on_update(Update(phase, step, model.train.steps, state=describe(loss, *found)))
+        return Trained(devices.on_one(state), history)
 
 
 def set_up_run_folder(folder: Path, config: Any, settings: dict[str, Any]) -> None:

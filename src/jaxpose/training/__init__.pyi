@@ -1,6 +1,8 @@
+from . import devices as devices
 from . import events as events
 from . import photometric as photometric
 from . import steps as steps
+from .devices import mesh as mesh
 from .events import EventData as EventData
 from .events import EventTrainConfig as EventTrainConfig
 from .photometric import Depths as Depths

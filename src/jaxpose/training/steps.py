@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from jaxpose import optim
 from jaxpose.fields import set_progress
+from jaxpose.training import devices
 
 Params: TypeAlias = Any
 Batch: TypeAlias = Any
@@ -41,11 +42,12 @@ class Trainer(NamedTuple):
     """Compiled functions of one training.
 
     `start(key)` is the state before the first step; `advance(state, data, count)` takes `count` (static)
-    steps on the data and returns the new state and the loss of each step.
+    steps on the data and returns the new state and the loss of each step. Within
+    `with jax.set_mesh(training.mesh()):` both use all devices: parameters are on each, rays are spread.
     """
 
     start: Callable[[PRNGKeyArray], State]
-    advance: Callable[[State, Batch, int], tuple[State, Float[Array, " k"]]]
+    advance: jax.stages.Wrapped
 
 
 class Decay(NamedTuple):
@@ -133,7 +135,9 @@ def joint(
     def start(key):
         scene_key, pose_key, key = jax.random.split(key, 3)
         params = {"scene": init_scene(scene_key), "pose": init_pose(pose_key)}
-        return State(**params, opt_state=optimizer.init(params), key=key, step=jnp.zeros((), jnp.int32))
+        opt_state = optimizer.init(params)
+        state = State(**params, opt_state=opt_state, key=key, step=jnp.zeros((), jnp.int32))
+        return devices.replicated(state)
 
     def step(state, _, data):
         key, loss_key = jax.random.split(state.key)
@@ -142,7 +146,8 @@ def joint(
         of_params = lambda params: loss(params["scene"], params["pose"], data, loss_key)
         value, gradient = jax.value_and_grad(of_params)(params)
         params, opt_state = optim.apply(optimizer, params, gradient, state.opt_state)
-        return State(**params, opt_state=opt_state, key=key, step=state.step + 1), value
+        state = State(**params, opt_state=opt_state, key=key, step=state.step + 1)
+        return devices.replicated(state), value
 
     def advance(state, data, count):
         return jax.lax.scan(partial(step, data=data), state, length=count)
@@ -214,7 +219,23 @@ def microbatched_sum(
 def _over_microbatches(
     function: Callable[[Batch], tuple[Any, Any]], batch: Batch, chunk: int
 ) -> tuple[Any, Any]:
-    """Sum of the first results of `function` over chunks of `batch`, and its second results joined."""
+    """Sum of the first results of `function` over chunks of `batch`, and its second results joined.
+
+    Each device adds up its own part of the batch; only the sums of the devices are added across them.
+    """
+    count, parts = len(jax.tree.leaves(batch)[0]), devices.shards()
+    if parts == 1:
+        return _in_turn(function, batch, chunk)
+    if count % parts:
+        raise ValueError(f"devices: expected a number that divides {count} rays or pixels, got {parts}")
+    batch = devices.spread(jax.tree.map(lambda x: x.reshape(parts, count // parts, *x.shape[1:]), batch))
+    sums, joined = jax.vmap(lambda part: _in_turn(function, part, chunk))(batch)
+    joined = jax.tree.map(lambda x: x.reshape(count, *x.shape[2:]), joined)
+    return jax.tree.map(lambda x: jnp.sum(x, axis=0), sums), joined
+
+
+def _in_turn(function: Callable[[Batch], tuple[Any, Any]], batch: Batch, chunk: int) -> tuple[Any, Any]:
+    """The same on one device, one chunk after the other."""
     count = len(jax.tree.leaves(batch)[0])
     whole = count - count % chunk
     sums = []

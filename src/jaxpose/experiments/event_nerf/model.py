@@ -64,6 +64,7 @@ def build(config: Config, problem: Problem) -> Model:
     else:
         scene, train = nerf(plan.scene), _PAPER if paper else _FAST
         train = replace(train, steps=config.steps or train.steps, events=config.events or train.events)
+    train = replace(train, chunk=config.devices.chunk(train.chunk))
     span = problem.span
     # EventNeRF's windows are up to a twentieth of a turn; a slide is short as it is.
     longest_s = (span[1] - span[0]) / (1 if problem.slides else 20)

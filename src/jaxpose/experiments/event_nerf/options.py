@@ -17,6 +17,7 @@ from jaxpose.errors import DataError
 from jaxpose.events import Mosaic
 from jaxpose.events.contrast import find_displacement
 from jaxpose.experiments.checks import check_least, check_positive, check_run_folder, check_unused
+from jaxpose.experiments.devices import DeviceConfig, Precision, check_devices
 from jaxpose.experiments.training_loop import CHUNK, NetConfig
 from jaxpose.files.trajectories import Trajectory
 from jaxpose.training.events import Loss
@@ -63,6 +64,9 @@ class Config:
     steps: int | None = None  # None: 3000, with preset paper 200,000
     events: int | None = None  # per step; None: 512, with preset paper 1024
     net: NetConfig = NetConfig()
+    # Of products in the scene's network on a GPU; a CPU has float32 alone. Poses are float32 in any case.
+    precision: Precision = "tensorfloat32"
+    devices: DeviceConfig = DeviceConfig()
     study: Study | None = None  # table 4 (known: 20, 10 and 6 instants), or offsets, both fields side by side
     resume: bool = False  # go on where a killed run stopped
     smoke: bool = False  # everything shrunk to seconds; the numbers then mean nothing
@@ -82,6 +86,7 @@ class Config:
         if self.poses == "unknown" and self.data == ORBIT:
             raise ValueError("--poses unknown: expected --data with a short recording, got the orbit")
         check_run_folder(self, None if self.data == ORBIT else self.data)
+        check_devices(self)
         if self.data != ORBIT:
             check_unused(self, ("image_width",), "with --data")
         if self.pose != "posenet" and self.study is None:
@@ -91,7 +96,7 @@ class Config:
 
 
 # What a run's numbers do not depend on.
-_INCIDENTAL = ("resume", "out", "name", "study", "json")
+_INCIDENTAL = ("devices", "resume", "out", "name", "study", "json")
 
 
 def resume_fingerprint(config: Config) -> dict[str, Any]:

@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 
 from jaxpose.evaluation import trajectory_error
-from jaxpose.experiments import training_loop
+from jaxpose.experiments import devices, training_loop
 from jaxpose.experiments.command import MODULE, Command, execute
+from jaxpose.experiments.devices import Job
 from jaxpose.experiments.event_nerf.evaluation import PROTOCOL, GroundTruth, Measured, find_truth, measure
 from jaxpose.experiments.event_nerf.model import Model, build, describe
 from jaxpose.experiments.event_nerf.options import (
@@ -59,17 +60,19 @@ def run(config: Config, on_update: OnUpdate = silent) -> Outcome:
     started = time.perf_counter()
     path = run_folder.folder_path("event_nerf", name=config.name, out=config.out)
     on_update(Update(f"run folder {path}"))
+    job = devices.join(config.devices, resume_fingerprint(config), on_update)
     on_update(Update("making the events" if config.data == ORBIT else f"reading {config.data}"))
     recording = read(config)
     problem = begin(config, recording)
-    with run_folder.opened(path) as folder:
+    with devices.opened(job, path) as folder:
         if config.study is None:
-            return Outcome(folder, _single(config, problem, folder, on_update, ""))
+            return Outcome(folder, _single(config, problem, folder, job, on_update, ""))
         results = {}
         for label, changed in studies(config, config.study).items():
             changed = replace(changed, study=None)
             with run_folder.opened(folder / label) as inner:
-                results[label] = _single(changed, begin(changed, recording), inner, on_update, label)
+                begun = begin(changed, recording)
+                results[label] = _single(changed, begun, inner, job, on_update, label)
         return training_loop.write_study(folder, "event_nerf", config, results, table(results), started)
 
 
@@ -99,17 +102,22 @@ def main(args: Sequence[str] | None = None, prog: str = MODULE + "event_nerf") -
 
 
 def _single(
-    config: Config, problem: Problem, folder: Path, on_update: OnUpdate, label: str
+    config: Config, problem: Problem, folder: Path, job: Job, on_update: OnUpdate, label: str
 ) -> dict[str, Any]:
     """One training, measured and written; what a killed or finished run has left is used with `resume`."""
     started = time.perf_counter()
     finished = folder / "results.json"
-    training_loop.set_up_run_folder(folder, config, resume_fingerprint(config))
-    if finished.exists():
-        return json.loads(finished.read_text())
+    if job.writes:
+        training_loop.set_up_run_folder(folder, config, resume_fingerprint(config))
+    if devices.from_first(job, job.writes and finished.exists()):
+        return json.loads(finished.read_text()) if job.writes else devices.followed(job)
     model = build(config, problem)
     ground_truth = find_truth(problem)
-    trained = _train(config, problem, model, ground_truth, folder / "checkpoint.npz", on_update, label)
+    checkpoint = folder / "checkpoint.npz"
+    trained = _train(config, problem, model, ground_truth, checkpoint, job, on_update, label)
+    devices.leave(job)
+    if not job.writes:
+        return devices.followed(job)
     measured = measure(problem, model, trained.state, ground_truth, on_update)
     on_update(Update("drawing figures"))
     _draw(folder, config, problem, measured, ground_truth)
@@ -134,9 +142,11 @@ def _train(
     model: Model,
     ground_truth: GroundTruth | None,
     checkpoint: Path,
+    job: Job,
     on_update: OnUpdate,
     label: str,
 ) -> Trained:
+    devices.check_divides(job, "--events", model.train.events)
     if ground_truth is None:
         errors = lambda params: (np.nan, np.nan)
     else:
@@ -150,6 +160,8 @@ def _train(
         errors,
         checkpoint,
         on_update,
+        job=job,
+        precision=config.precision,
         label=label,
         describe=describe_step,
     )

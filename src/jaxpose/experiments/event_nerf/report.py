@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+from jaxpose.experiments.devices import follower_report
 from jaxpose.experiments.outcome import SMOKE, cost_text, markdown_table, number
 
 _COLUMNS: tuple[str, ...] = (
@@ -47,6 +48,8 @@ def table(runs: dict[str, dict[str, Any]]) -> str:
 
 def report(folder: Path, results: dict[str, Any]) -> str:
     """The numbers of a run with their protocol, and where everything is."""
+    if "process" in results:
+        return follower_report(results)
     runs = results.get("runs") or {results["training"]["pose"]: results}
     one = next(iter(runs.values()))
     data, training, protocol = one["data"], one["training"], one["protocol"]

@@ -64,6 +64,7 @@ def build(config: Config, problem: Problem) -> Model:
     else:
         scene, train = (nerf(), _PAPER) if paper else (nerf(_fast_scene(config)), _FAST)
         train = replace(train, steps=config.steps or train.steps, rays=config.rays or train.rays)
+    train = replace(train, chunk=config.devices.chunk(train.chunk))
     scene_rate = Decay(5e-4 if paper and barf == "depth" else 1e-3, 1e-4)
     t = jnp.asarray(photographs.t, jnp.float32)
     rates = _rates(config, problem)

@@ -15,6 +15,7 @@ from jaxpose.datasets.synthetic.orbit import DIAMETER, orbit
 from jaxpose.datasets.types import Photographs, every, take
 from jaxpose.errors import DataError
 from jaxpose.experiments.checks import check_least, check_positive, check_run_folder, check_unused
+from jaxpose.experiments.devices import DeviceConfig, Precision, check_devices
 from jaxpose.experiments.training_loop import CHUNK, NetConfig
 from jaxpose.geometry import rigid
 
@@ -61,6 +62,9 @@ class Config:
     spline_knots: int = 25  # of both splines
     spline_smoothing: float = 1e-3  # of spline_reset: scipy's bound on the sum of squares, per dimension
     test_pose_steps: int = 100  # of test-time refinement of each held-out pose; 0: none
+    # Of products in the scene's network on a GPU; a CPU has float32 alone. Poses are float32 in any case.
+    precision: Precision = "tensorfloat32"
+    devices: DeviceConfig = DeviceConfig()
     study: Study | None = None  # runs of table 11 (fields), 3 (encoding), 12 (size), 10 (spline) side by side
     resume: bool = False  # go on where a killed run stopped
     smoke: bool = False  # everything shrunk to seconds; the numbers then mean nothing
@@ -80,6 +84,7 @@ class Config:
         if self.steps is not None and self.steps % CHUNK:
             raise ValueError(f"--steps: expected a multiple of {CHUNK}, got {self.steps}")
         check_run_folder(self, None if self.data == ORBIT else self.data)
+        check_devices(self)
         self._check_unused()
 
     def _check_unused(self):
@@ -100,7 +105,7 @@ class Config:
 
 
 # What a run's numbers do not depend on.
-_INCIDENTAL = ("resume", "out", "name", "study", "json")
+_INCIDENTAL = ("devices", "resume", "out", "name", "study", "json")
 
 
 def resume_fingerprint(config: Config) -> dict[str, Any]:

@@ -20,8 +20,9 @@ from jaxtyping import Float
 
 from jaxpose.datasets.photos import blender
 from jaxpose.datasets.photos.transforms_json import write_transforms
-from jaxpose.experiments import training_loop
+from jaxpose.experiments import devices, training_loop
 from jaxpose.experiments.command import MODULE, Command, execute
+from jaxpose.experiments.devices import Job
 from jaxpose.experiments.noisy_nerf.evaluation import PROTOCOL, Measured, measure
 from jaxpose.experiments.noisy_nerf.model import Model, build, describe, splined
 from jaxpose.experiments.noisy_nerf.options import (
@@ -60,15 +61,16 @@ def run(config: Config, on_update: OnUpdate = silent) -> Outcome:
     started = time.perf_counter()
     path = run_folder.folder_path("noisy_nerf", name=config.name, out=config.out)
     on_update(Update(f"run folder {path}"))
+    job = devices.join(config.devices, resume_fingerprint(config), on_update)
     on_update(Update("making the photographs" if config.data == ORBIT else f"reading {config.data}"))
     problem = load(config)
-    with run_folder.opened(path) as folder:
+    with devices.opened(job, path) as folder:
         if config.study is None:
-            return Outcome(folder, _single(config, problem, folder, on_update, ""))
+            return Outcome(folder, _single(config, problem, folder, job, on_update, ""))
         results, histories = {}, {}
         for label, changed in studies(config, config.study).items():
             with run_folder.opened(folder / label) as inner:
-                results[label] = _single(replace(changed, study=None), problem, inner, on_update, label)
+                results[label] = _single(replace(changed, study=None), problem, inner, job, on_update, label)
             histories[label] = _history(np.array(results[label]["history"], float))
         nerf_plots.curves(folder / "curves.png", histories, f"{_title(problem)}: {config.study}")
         return training_loop.write_study(folder, "noisy_nerf", config, results, table(results), started)
@@ -79,15 +81,15 @@ def train(
     problem: Problem,
     model: Model,
     checkpoint: Path,
+    job: Job,
     on_update: OnUpdate,
     label: str,
 ) -> Trained:
     """Train to the end, from the checkpoint if there is one, and keep one as it goes."""
+    devices.check_divides(job, "--rays", model.train.rays)
     poses = training_loop.pose_reader(model.field, problem.train.t)
 
     def between(state):
-        if config.pose != "spline_reset":
-            return state
         smooth = splined(state.pose, problem.train.t, config.spline_knots, config.spline_smoothing)
         return state._replace(pose=smooth)
 
@@ -98,9 +100,11 @@ def train(
         lambda params: training_loop.mean_errors(poses(params), problem.train.T_world_cam),
         checkpoint,
         on_update,
+        job=job,
+        precision=config.precision,
         label=label,
         describe=partial(describe_step, problem.extent),
-        between=between,
+        between=between if config.pose == "spline_reset" else None,
     )
 
 
@@ -130,16 +134,20 @@ def main(args: Sequence[str] | None = None, prog: str = MODULE + "noisy_nerf") -
 
 
 def _single(
-    config: Config, problem: Problem, folder: Path, on_update: OnUpdate, label: str
+    config: Config, problem: Problem, folder: Path, job: Job, on_update: OnUpdate, label: str
 ) -> dict[str, Any]:
     """One training, measured and written; what a killed or finished run has left is used with `resume`."""
     started = time.perf_counter()
     checkpoint, finished = folder / "checkpoint.npz", folder / "results.json"
-    training_loop.set_up_run_folder(folder, config, resume_fingerprint(config))
-    if finished.exists():
-        return json.loads(finished.read_text())
+    if job.writes:
+        training_loop.set_up_run_folder(folder, config, resume_fingerprint(config))
+    if devices.from_first(job, job.writes and finished.exists()):
+        return json.loads(finished.read_text()) if job.writes else devices.followed(job)
     model = build(config, problem)
-    trained = train(config, problem, model, checkpoint, on_update, label)
+    trained = train(config, problem, model, checkpoint, job, on_update, label)
+    devices.leave(job)
+    if not job.writes:
+        return devices.followed(job)
     T_world_cam = training_loop.pose_reader(model.field, problem.train.t)(trained.state.pose)
     measured = measure(config, problem, model, trained.state, T_world_cam, on_update)
     on_update(Update("drawing figures"))
