@@ -170,6 +170,20 @@ def test_an_imu_bridges_two_seconds_of_darkness(walk):
 
 
 @pytest.mark.slow
+def test_a_gyroscope_s_bias_is_found_where_features_know_the_motion_too():
+    recording, bias = room(RoomConfig(duration_s=2.0, width=160, height=120)), np.array([0.05, -0.08, 0.06])
+    assert recording.imu is not None
+    imu = recording.imu._replace(omega_body=recording.imu.omega_body + bias)
+    seen = []
+    run(
+        recording._replace(imu=imu),
+        SlamConfig(imu="combined"),
+        lambda p: seen.append(p.state.motion.gyro_bias),
+    )
+    assert np.abs(seen[-1] - bias).max() < 0.01 < 0.04 < np.abs(seen[0] - bias).max()
+
+
+@pytest.mark.slow
 def test_without_true_poses_the_readings_find_their_gravity(walk):
     ground_truth = walk.T_world_cam
     assert ground_truth is not None
