@@ -75,16 +75,14 @@ def read_depth(file: Path, per_metre: float = 1000.0) -> np.ndarray:
     counts = open_image(file, np.asarray)
     if counts.dtype != np.uint16 or counts.ndim != 2:
         found = f"{counts.dtype} of shape {counts.shape}"
-        raise DataError(f"{file}: expected depth in {_unit(per_metre)}, one channel of 16 bits, got {found}")
+        raise DataError(f"{file}: expected {depth_unit(per_metre)}, one channel of 16 bits, got {found}")
     return np.where(counts == _NONE, 0, counts) / np.float32(per_metre)
 
 
 def check_depth(folder: Path, files: Sequence[Path], per_metre: float = 1000.0) -> None:
     """Refuse a sequence whose depth, looked at here and there, is never valid."""
-    unit = f"depth in {_unit(per_metre)}"
-    check_some_depth(
-        folder, len(files), lambda i: read_depth(files[i], per_metre), lambda i: files[i].name, unit
-    )
+    depth = lambda i: read_depth(files[i], per_metre)
+    check_some_depth(folder, len(files), depth, lambda i: files[i].name, depth_unit(per_metre))
 
 
 def check_some_depth(
@@ -101,8 +99,9 @@ def check_some_depth(
         raise DataError(f"{where}: expected {unit}, got only 0 and {_NONE} (none) in {looked_at}")
 
 
-def _unit(per_metre: float) -> str:
-    return "mm" if per_metre == 1000 else f"1/{per_metre:g} m"
+def depth_unit(per_metre: float) -> str:
+    """Depth in words."""
+    return "depth in mm" if per_metre == 1000 else f"depth in 1/{per_metre:g} m"
 
 
 # --- numbers ------------------------------------------------------------------------------------------------

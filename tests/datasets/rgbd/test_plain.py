@@ -8,6 +8,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from jaxpose.datasets.rgbd import plain
+from jaxpose.datasets.rgbd.registry import load_recording
 from jaxpose.errors import DataError
 
 K = "30 0 15.5\n0 31 11.5\n0 0 1\n"
@@ -138,7 +139,7 @@ def test_intrinsics_in_json(desk, walk, metres):
         (CAMERA | {"fx": "wide"}, "intrinsics.json: fx: expected a finite number, got 'wide'"),
         (CAMERA | {"fx": -1}, "intrinsics.json: expected fx 0 cx"),
         (CAMERA | {"width": 64}, "intrinsics.json: expected the size of the images, 32x24, got 64x24"),
-        (CAMERA | {"depth_scale": 0}, "intrinsics.json: expected a positive depth_scale, got 0"),
+        (CAMERA | {"depth_scale": 0}, "intrinsics.json: depth_scale: expected a finite number above 0"),
     ],
 )
 def test_unusable_json_is_named(desk, values, message):
@@ -150,7 +151,7 @@ def test_unusable_json_is_named(desk, values, message):
 @pytest.mark.parametrize(
     "file, content, message",
     [
-        ("times.txt", "1\n2\n", "times.txt: expected 6 lines, one for each image in color/, got 2"),
+        ("times.txt", "1\n2\n", "times.txt: expected 6 lines, one for each colour image, got 2"),
         ("times.txt", "1\n2\n3\n3\n4\n5\n", "times.txt:4: expected a timestamp after 3.0 s, got 3.0 s"),
         ("times.txt", "1\ntwo\n", "times.txt:2: expected 1 number"),
         (
@@ -162,7 +163,7 @@ def test_unusable_json_is_named(desk, values, message):
         ("poses.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n", "poses.txt: expected 6 lines, .*, got 1"),
         ("poses.txt", "1 0 0 0 0 0 0 1\n", "poses.txt: expected 6 lines, .*, got 1"),
         ("poses.txt", "-1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1\n" * 6, "poses.txt: pose 0: expected a pose"),
-        ("camera-intrinsics.txt", None, "desk: expected camera-intrinsics.txt or intrinsics.json in it"),
+        ("camera-intrinsics.txt", None, "desk: expected one of camera-intrinsics.txt, intrinsics.json,"),
         ("camera-intrinsics.txt", "30 31 15 11\n", "intrinsics.txt:1: expected 3 numbers, got 4"),
         ("color/r_6.png", "text", "color/r_6.png: expected an image"),
     ],
@@ -203,3 +204,54 @@ def test_wrong_folders(desk, tmp_path):
         plain.load(desk)
     with pytest.raises(ValueError, match="depth_per_metre"):
         plain.load(desk, depth_per_metre=0.0)
+
+
+# --- captures of other programs in the same folders ---------------------------------------------------------
+
+
+def test_a_capture_of_open3d(tmp_path, walk, save, metres):
+    """Colour is jpg of 6 digits, the matrix is written column by column, poses are in blocks of 5 lines."""
+    for i in range(6):
+        save(tmp_path / f"color/{i:06d}.png", walk.rgb[i])
+        save(tmp_path / f"depth/{i:05d}.png", walk.counts[i])
+    matrix = [30.0, 0, 0, 0, 31.0, 0, 15.0, 11.0, 1]
+    (tmp_path / "camera_intrinsic.json").write_text(
+        json.dumps({"width": 32, "height": 24, "intrinsic_matrix": matrix, "depth_scale": 4000.0})
+    )
+    (tmp_path / "scene").mkdir()
+    blocks = [
+        f"{i} {i} {i + 1}\n" + "\n".join(" ".join(f"{x:.12g}" for x in row) for row in walk.T_world_cam[i])
+        for i in (0, 1, 2, 4, 5)
+    ]
+    (tmp_path / "scene/trajectory.log").write_text("\n".join(blocks) + "\n")
+    recording = load_recording(tmp_path)
+    assert recording.camera == (30, 31, 15, 11, 32, 24, ())
+    np.testing.assert_allclose(recording.read(4).depth, metres(walk.counts[4], 4000), rtol=1e-6)
+    np.testing.assert_allclose(recording.T_world_cam[[0, 5]], walk.T_world_cam[[0, 5]], atol=1e-9)
+    assert np.isnan(recording.T_world_cam[3]).all()
+    (tmp_path / "scene/trajectory.log").write_text(blocks[0][:40])
+    with pytest.raises(
+        DataError, match="trajectory.log:1: expected a line of three numbers and four of a 4x4"
+    ):
+        load_recording(tmp_path)
+
+
+def test_depth_smaller_than_colour_and_other_names_of_folders(tmp_path, walk, save):
+    for i in range(6):
+        save(tmp_path / f"image/{i}.png", np.repeat(np.repeat(walk.rgb[i], 2, 0), 2, 1))
+        save(tmp_path / f"depth/{i}.png", walk.counts[i])
+        (tmp_path / f"image/._{i}.png").write_bytes(b"resource fork")
+    (tmp_path / "camera-intrinsics.txt").write_text("60 0 30.5\n0 62 22.5\n0 0 1\n")
+    recording = load_recording(tmp_path)
+    assert recording.camera == (30, 31, 15, 11, 32, 24, ())
+    large = Image.fromarray(np.repeat(np.repeat(walk.rgb[2], 2, 0), 2, 1))
+    np.testing.assert_array_equal(recording.read(2).rgb, large.resize((32, 24), Image.Resampling.BILINEAR))
+    assert "colour resized from 64x48 to 32x24, the size of depth" in recording.notes
+
+
+def test_a_depth_scale_that_is_upside_down_is_refused(tmp_path, walk, save):
+    save(tmp_path / "color/0.png", walk.rgb[0])
+    save(tmp_path / "depth/0.png", walk.counts[0])
+    (tmp_path / "intrinsics.json").write_text(json.dumps(CAMERA | {"depth_scale": 0.001}))
+    with pytest.raises(DataError, match="depth_scale: expected counts a metre, got 0.001"):
+        load_recording(tmp_path)

@@ -43,6 +43,16 @@ def test_a_made_scene_reads_back(scene, walk, metres):
         np.testing.assert_allclose(depth, metres(walk.counts[i], 1000), rtol=1e-6)
 
 
+def test_names_with_zeros_before_the_number_keep_their_poses(scene, walk):
+    for kind, zeros in (("color", 6), ("depth", 5), ("pose", 4)):
+        for file in (scene / kind).iterdir():
+            file.rename(file.with_stem(file.stem.zfill(zeros)))
+    (scene / "pose/._0000.txt").write_bytes(b"resource fork")
+    recording = scannet.load(scene, rate_hz=10.0)
+    np.testing.assert_allclose(recording.T_world_cam, walk.T_world_cam, atol=1e-12)
+    np.testing.assert_allclose(recording.t, np.array(NUMBERS) / 10)
+
+
 def test_a_resized_image_stays_where_it_is(scene, save):
     """An edge at half the width of colour is at half the width of depth."""
     half = np.zeros((48, 64, 3), np.uint8)
@@ -76,7 +86,7 @@ def test_lost_poses_are_missing_truth(scene, walk):
     recording = scannet.load(scene)
     np.testing.assert_array_equal(np.isnan(recording.T_world_cam).all((1, 2)), [0, 1, 0, 1, 0])
     np.testing.assert_allclose(recording.T_world_cam[4], walk.T_world_cam[4], atol=1e-12)
-    assert recording.notes[0] == "1 frames skipped, without color or depth: 100"
+    assert recording.notes[0] == "1 frames skipped: 100 has no color"
     assert recording.notes[2] == "2 frames without a usable pose (none, NaN or infinity): 2, 10"
 
 
@@ -125,5 +135,5 @@ def test_wrong_folders(scene, tmp_path):
             scannet.load(path)
     for file in (scene / "depth").iterdir():
         file.rename(file.with_stem(f"frame{file.stem}"))
-    with pytest.raises(DataError, match="depth: expected images N.jpg or N.png, got frame0.png, "):
+    with pytest.raises(DataError, match="depth: expected color/N.jpg, .* got frame0.png, "):
         scannet.load(scene)

@@ -101,6 +101,25 @@ def test_published_intrinsics_are_assumed_aloud(tmp_path):
     assert small.notes[0].endswith("which are for 640x480; the images are 64x48")
 
 
+def test_bundlefusion_has_its_own_camera_and_scale(tmp_path):
+    """The lines of `info.txt` of graphics.stanford.edu/projects/bundlefusion."""
+    for number in range(2):
+        write_frame(tmp_path, number, suffix="jpg")
+    one = "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"
+    K = "50 0 31.5 0 0 52 23.5 0 0 0 1 0 0 0 0 1"
+    (tmp_path / "info.txt").write_text(
+        "m_versionNumber = 4\nm_sensorName = StructureSensor\nm_colorWidth = 64\nm_colorHeight = 48\n"
+        f"m_depthWidth = 64\nm_depthHeight = 48\nm_depthShift = 2000\nm_calibrationColorIntrinsic = {K}\n"
+        f"m_calibrationColorExtrinsic = {one}\nm_calibrationDepthIntrinsic = {K} \nm_frames.size = 2\n"
+    )
+    recording = sevenscenes.load(tmp_path)
+    assert recording.camera == (50, 52, 31.5, 23.5, 64, 48, ()) and recording.notes == ()
+    np.testing.assert_allclose(recording.read(1).depth[1:], depth_of(1)[1:] / 2000, rtol=1e-7)
+    (tmp_path / "info.txt").write_text("m_depthShift = 1000\n")
+    with pytest.raises(DataError, match="info.txt: expected m_calibrationDepthIntrinsic, m_depthWidth"):
+        sevenscenes.load(tmp_path)
+
+
 # --- what is skipped or repaired, and told ------------------------------------------------------------------
 
 
@@ -108,7 +127,7 @@ def test_incomplete_frames_are_skipped_aloud(scene):
     (scene / "seq-01" / "frame-000001.depth.png").unlink()
     (scene / "seq-01" / "frame-000004.color.png").unlink()
     recording = sevenscenes.load(scene)
-    assert recording.notes == ("2 frames skipped: 000001 has no depth, 000004 has no color",)
+    assert recording.notes == ("2 frames skipped: 1 has no depth, 4 has no color",)
     np.testing.assert_allclose(recording.t, [0, 2 / 30, 5 / 30])
     np.testing.assert_array_equal(recording.read(2).rgb, color_of(5))
     np.testing.assert_allclose(recording.T_world_cam[:, 0, 3], [0, 2, 5])
@@ -251,7 +270,7 @@ def test_a_folder_without_a_sequence_is_refused(scene, tmp_path):
 def test_only_incomplete_frames_are_no_frames(scene):
     for file in (scene / "seq-01").glob("*.depth.png"):
         file.unlink()
-    with pytest.raises(DataError, match="seq-01: expected .*, got 000000 has no depth, 000001 has no depth"):
+    with pytest.raises(DataError, match="seq-01: expected .*, got 0 has no depth, 1 has no depth"):
         sevenscenes.load(scene)
 
 

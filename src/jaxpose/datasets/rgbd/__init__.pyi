@@ -1,10 +1,16 @@
+from . import arkitscenes as arkitscenes
 from . import euroc as euroc
 from . import icl_nuim as icl_nuim
+from . import nerfstudio as nerfstudio
 from . import plain as plain
+from . import polycam as polycam
+from . import record3d as record3d
 from . import replica as replica
 from . import ros as ros
 from . import scannet as scannet
 from . import sevenscenes as sevenscenes
+from . import stray_scanner as stray_scanner
+from . import sun3d as sun3d
 from . import tum as tum
 from .registry import find_format as find_format
 from .registry import load_recording as load_recording

@@ -9,26 +9,19 @@ from jaxtyping import Float
 from jaxpose.datasets.images import (
     INTRINSICS,
     Pinhole,
-    check_depth,
-    common_size,
     default_intrinsics,
     found,
     frame_times,
-    name_of,
     only,
-    read_color,
-    read_depth,
     read_intrinsics,
     sidecar,
     some,
-    usable_poses,
-    within,
 )
-from jaxpose.datasets.types import Frame, Recording
+from jaxpose.datasets.rgbd.frames import Listing, Poses, of_files
+from jaxpose.datasets.types import Recording
 from jaxpose.errors import DataError
 from jaxpose.files.tables import numbered_lines
 from jaxpose.files.trajectories import read_tum
-from jaxpose.geometry.camera import Camera
 from jaxpose.imu import GRAVITY_WORLD
 
 _LIST, _TRUTH, _PUBLISHED_TRUTH = "associations.txt", "groundtruth.txt", "*.gt.freiburg"
@@ -40,11 +33,11 @@ _MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 
 
 class _Pair(NamedTuple):
-    """The images of a frame, as listed."""
+    """The names of a frame's images, as listed."""
 
     number: int
-    color: Path
-    depth: Path
+    color: str
+    depth: str
 
 
 def detect(path: Path) -> bool:
@@ -84,21 +77,17 @@ def load(path: Path | str, *, rate_hz: float = 30.0) -> Recording:
     folder = Path(path)
     pairs, skipped = _existing(folder, _read_list(folder))
     numbers, colors, depths = (list(column) for column in zip(*pairs, strict=True))
-    t = frame_times(numbers, rate_hz)
-    size = common_size([*colors, *depths])
-    pinhole, assumed = _intrinsics(folder, size)
-    check_depth(folder, depths, _PER_METRE)
-    read_color(colors[0])
-    poses, lacking = _read_poses(folder, numbers)
-    return Recording(
-        name=name_of(folder),
-        camera=Camera(*pinhole, *size),
-        t=t,
-        read=lambda i: Frame(read_color(colors[i]), read_depth(depths[i], _PER_METRE)),
-        T_world_cam=poses,
+    return of_files(
+        path,
+        colors,
+        depths,
+        lambda size, depth_size: _intrinsics(folder, size),
+        t=frame_times(numbers, rate_hz),
+        names=[str(number) for number in numbers],
+        poses=_read_poses(folder, numbers),
+        per_metre=_PER_METRE,
+        notes=skipped,
         gravity_world=np.array([0.0, np.linalg.norm(GRAVITY_WORLD), 0.0]),
-        notes=(*skipped, *assumed, *lacking),
-        files=within(colors, path),
     )
 
 
@@ -109,7 +98,7 @@ def _read_list(folder: Path) -> list[_Pair]:
         raise DataError(f"{folder}: expected a folder with {_LIST}, depth/ and rgb/, got {found(folder)}")
     pairs: list[_Pair] = []
     for number, line in numbered_lines(file):
-        pair = _parse(folder, line)
+        pair = _parse(line)
         if pair is None:
             raise DataError(f"{file}:{number}: expected {_LINES}, got {line[:60]!r}")
         if pairs and pair.number <= pairs[-1].number:
@@ -122,7 +111,7 @@ def _read_list(folder: Path) -> list[_Pair]:
     return pairs
 
 
-def _parse(folder: Path, line: str) -> _Pair | None:
+def _parse(line: str) -> _Pair | None:
     """The images of a line of the list; None for what is no such line."""
     words = line.split()
     if len(words) != 4:
@@ -132,14 +121,18 @@ def _parse(folder: Path, line: str) -> _Pair | None:
     if not frame.isdecimal() or not same.isdecimal() or int(frame) != int(same) or sum(is_depth) != 1:
         return None
     depth, color = (first, second) if is_depth[0] else (second, first)
-    return _Pair(int(frame), folder / color, folder / depth)
+    return _Pair(int(frame), color, depth)
 
 
-def _existing(folder: Path, pairs: list[_Pair]) -> tuple[list[_Pair], tuple[str, ...]]:
-    """The frames that have both images, and a note on the others."""
-    there, lacking = [], []
+def _existing(folder: Path, pairs: list[_Pair]) -> tuple[list[tuple[int, Path, Path]], tuple[str, ...]]:
+    """Number, colour and depth of the frames that have both, and a note on the others."""
+    listing, there, lacking = Listing(folder), [], []
     for pair in pairs:
-        (there if pair.color.is_file() and pair.depth.is_file() else lacking).append(pair)
+        color, depth = listing.find(pair.color), listing.find(pair.depth)
+        if color is None or depth is None:
+            lacking.append(pair)
+        else:
+            there.append((pair.number, color, depth))
     numbers = some([str(pair.number) for pair in lacking])
     if not there:
         raise DataError(
@@ -161,14 +154,12 @@ def _intrinsics(folder: Path, size: tuple[int, int]) -> tuple[Pinhole, tuple[str
     return _PUBLISHED, (default_intrinsics(_PUBLISHED, size, _PUBLISHED_SIZE, INTRINSICS),)
 
 
-def _read_poses(
-    folder: Path, numbers: list[int]
-) -> tuple[Float[np.ndarray, "n 4 4"] | None, tuple[str, ...]]:
-    """Ground truth by frame number, in OpenCV's axes, and notes on what is missing."""
-    file, candidates = folder / _TRUTH, sorted(folder.glob(_PUBLISHED_TRUTH))
+def _read_poses(folder: Path, numbers: list[int]) -> Poses:
+    """Ground truth by frame number, in OpenCV's axes."""
+    file, candidates = folder / _TRUTH, [f for f in sorted(folder.glob(_PUBLISHED_TRUTH)) if f.name[0] != "."]
     if not file.is_file():
         if not candidates:
-            return None, (f"no {_TRUTH} or {_PUBLISHED_TRUTH}: there is no ground truth to compare with",)
+            return Poses(None, str, missing=f"no {_TRUTH} or {_PUBLISHED_TRUTH}")
         file = only(candidates, folder, f"{_TRUTH} or one {_PUBLISHED_TRUTH}")
     ground_truth = read_tum(file)
     stated: dict[int, Float[np.ndarray, "4 4"]] = {}
@@ -178,4 +169,4 @@ def _read_poses(
         stated[int(frame)] = _MIRROR @ pose @ _MIRROR
     none = np.full((4, 4), np.nan)
     poses = np.stack([stated.get(number, none) for number in numbers])
-    return usable_poses(poses, [str(n) for n in numbers], lambda i: str(file), f"none in {file.name}")
+    return Poses(poses, lambda i: str(file), f"none in {file.name}")

@@ -5,12 +5,43 @@ from pathlib import Path
 from types import ModuleType
 from typing import Literal, NamedTuple, get_args
 
-from jaxpose.datasets.images import found, some
-from jaxpose.datasets.rgbd import euroc, icl_nuim, plain, replica, ros, scannet, sevenscenes, tum
+from jaxpose.datasets.images import INTRINSICS, found, some
+from jaxpose.datasets.rgbd import (
+    arkitscenes,
+    euroc,
+    icl_nuim,
+    nerfstudio,
+    plain,
+    plain_files,
+    polycam,
+    record3d,
+    replica,
+    ros,
+    scannet,
+    sevenscenes,
+    stray_scanner,
+    sun3d,
+    tum,
+)
 from jaxpose.datasets.types import Recording
 from jaxpose.errors import DataError
 
-Format = Literal["ros", "sevenscenes", "tum", "replica", "scannet", "euroc", "icl_nuim", "plain"]
+Format = Literal[
+    "ros",
+    "record3d",
+    "stray_scanner",
+    "arkitscenes",
+    "polycam",
+    "nerfstudio",
+    "sevenscenes",
+    "tum",
+    "replica",
+    "scannet",
+    "euroc",
+    "icl_nuim",
+    "sun3d",
+    "plain",
+]
 _ARCHIVES = (".zip", ".tgz", ".gz", ".tar", ".7z", ".rar")
 _MOST_FOLDERS = 200  # looked into for recordings, where a path is none itself
 
@@ -35,19 +66,55 @@ LAYOUTS: dict[Format, Layout] = {
         ("topics",),
         "bags that rosbags writes",
     ),
+    "record3d": Layout(
+        "Record3D (extra `phone`)",
+        ("*.r3d|metadata", "*.r3d|rgbd/*.jpg", "*.r3d|rgbd/*.depth"),
+        record3d,
+        (),
+        "a zip in the app's layout, by lzfse",
+    ),
+    "stray_scanner": Layout(
+        "Stray Scanner (extra `video`)",
+        ("rgb.mp4", "depth/*.png", "odometry.csv", "camera_matrix.csv"),
+        stray_scanner,
+        (),
+        "a folder in the app's layout, by PyAV",
+    ),
+    "arkitscenes": Layout(
+        "ARKitScenes",
+        tuple(f"lowres_{name}|*_frames/lowres_{name}" for name in ("wide", "depth", "wide_intrinsics")),
+        arkitscenes,
+        (),
+        "a made folder",
+    ),
+    "polycam": Layout(
+        "Polycam, raw data",
+        tuple(f"keyframes/{name}" for name in ("images", "depth", "cameras")),
+        polycam,
+        _RATE,
+        "a made folder",
+    ),
+    "nerfstudio": Layout(
+        "nerfstudio with depth", ("transforms.json",), nerfstudio, _RATE, "a made folder"
+    ),
     "sevenscenes": Layout(
-        "7-Scenes",
+        "7-Scenes, BundleFusion",
         ("frame-*.color.png|frame-*.color.jpg", "frame-*.depth.png"),
         sevenscenes,
         _RATE,
-        "a made folder, RedKitchen",
+        "made folders, RedKitchen",
     ),
-    "tum": Layout("TUM RGB-D", ("rgb.txt", "depth.txt"), tum, (), "a made folder, fr1/rpy"),
+    "tum": Layout(
+        "TUM RGB-D, Bonn, ETH3D SLAM", ("rgb.txt", "depth.txt"), tum, (), "made folders, fr1/rpy"
+    ),
     "replica": Layout(
         "Replica (NICE-SLAM's)", ("results/frame*", "results/depth*"), replica, _RATE, "a made folder"
     ),
     "scannet": Layout(
-        "ScanNet", ("color/*|frames/color/*", "depth/*|frames/depth/*", "pose|frames/pose"), scannet, _RATE,
+        "ScanNet",
+        ("color|frames/color", "depth|frames/depth", "pose|frames/pose"),
+        scannet,
+        _RATE,
         "a made folder",
     ),
     "euroc": Layout(
@@ -60,12 +127,15 @@ LAYOUTS: dict[Format, Layout] = {
     "icl_nuim": Layout(
         "ICL-NUIM", ("associations.txt", "rgb/*", "depth/*"), icl_nuim, _RATE, "a made folder, kt3"
     ),
+    "sun3d": Layout(
+        "SUN3D, Redwood's scans", ("image/*-*.jpg|rgb/*-*.jpg", "depth/*-*.png"), sun3d, (), "a made folder"
+    ),
     "plain": Layout(
-        "a plain folder",
-        ("color/*", "depth/*", "camera-intrinsics.txt|intrinsics.json"),
+        "a plain folder; Open3D, RealSense and Redwood captures",
+        ("color|rgb|image|images", "depth", "|".join((INTRINSICS, *plain_files.JSON))),
         plain,
         _RATE,
-        "a made folder",
+        "made folders",
     ),
 }  # fmt: skip
 

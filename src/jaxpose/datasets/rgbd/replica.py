@@ -1,37 +1,28 @@
 """Replica as NICE-SLAM renders it: `results/frameNNNNNN.jpg`, `results/depthNNNNNN.png` and `traj.txt`."""
 
-import math
 import re
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from jaxpose.datasets.images import (
     Pinhole,
-    check_depth,
     check_intrinsics,
-    common_size,
     default_intrinsics,
     found,
     frame_times,
-    name_of,
-    read_color,
-    read_depth,
+    image_size,
     sidecar,
-    some,
-    usable_poses,
-    within,
 )
-from jaxpose.datasets.types import Frame, Recording
+from jaxpose.datasets.rgbd.frames import Poses, of_files, pair_numbered, visible
+from jaxpose.datasets.types import Recording
 from jaxpose.errors import DataError
-from jaxpose.files import schema
+from jaxpose.files.schema import numbers
 from jaxpose.files.tables import read_numbers
 from jaxpose.files.untrusted import read_json
-from jaxpose.geometry.camera import Camera
 
-_IMAGE = re.compile(r"(frame|depth)(\d+)\.(jpg|jpeg|png)")
+_IMAGE = re.compile(r"(frame|depth)(\d+)\.(jpg|jpeg|png)", re.IGNORECASE)
 _LAYOUT = "results/frameNNNNNN.jpg with results/depthNNNNNN.png"
 _PARAMETERS = "cam_params.json"
 _PUBLISHED, _PUBLISHED_SIZE = Pinhole(600.0, 600.0, 599.5, 339.5), (1200, 680)
@@ -77,41 +68,26 @@ def load(path: Path | str, *, rate_hz: float = 30.0) -> Recording:
         ValueError: For a rate that is not positive.
     """
     folder = Path(path)
-    numbers, colors, depths, skipped = _list_frames(folder)
-    t = frame_times(numbers, rate_hz)
-    size = common_size([*colors, *depths])
-    pinhole, per_metre, assumed = _read_parameters(folder, size)
-    check_depth(folder, depths, per_metre)
-    read_color(colors[0])
-    poses, lacking = _read_poses(folder / "traj.txt", numbers)
-    return Recording(
-        name=name_of(folder),
-        camera=Camera(*pinhole, *size),
-        t=t,
-        read=lambda i: Frame(read_color(colors[i]), read_depth(depths[i], per_metre)),
-        T_world_cam=poses,
-        notes=(*skipped, *assumed, *lacking),
-        files=within(colors, path),
-    )
-
-
-def _list_frames(folder: Path) -> tuple[list[int], list[Path], list[Path], tuple[str, ...]]:
-    """Numbers and images of the frames that have both, in order, and a note on those that lack one."""
     results = folder / "results"
     if not results.is_dir():
         raise DataError(f"{folder}: expected a folder of {_LAYOUT}, got {found(folder)}")
     files: dict[str, dict[int, Path]] = {"frame": {}, "depth": {}}
-    for file in sorted(results.iterdir()):
+    for file in visible(results):
         if match := _IMAGE.fullmatch(file.name):
-            files[match[1]][int(match[2])] = file
-    color, depth = files["frame"], files["depth"]
-    both = sorted(color.keys() & depth.keys())
-    lacking = [f"{number:06d}" for number in sorted(color.keys() ^ depth.keys())]
-    if not both:
-        got = f"half of it for {some(lacking)}" if lacking else found(results)
-        raise DataError(f"{folder}: expected {_LAYOUT}, got {got}")
-    skipped = (f"{len(lacking)} frames skipped, without color or depth: {some(lacking)}",) if lacking else ()
-    return both, [color[number] for number in both], [depth[number] for number in both], skipped
+            files[match[1].lower()][int(match[2])] = file
+    pairs = pair_numbered(folder, _LAYOUT, files["frame"], files["depth"], found(results))
+    pinhole, per_metre, assumed = _read_parameters(folder, image_size(pairs.colors[0]))
+    return of_files(
+        path,
+        pairs.colors,
+        pairs.depths,
+        lambda size, depth_size: (pinhole, assumed),
+        t=frame_times(pairs.numbers, rate_hz),
+        names=[f"{number:06d}" for number in pairs.numbers],
+        poses=_read_poses(folder / "traj.txt", pairs.numbers),
+        per_metre=per_metre,
+        notes=pairs.notes,
+    )
 
 
 def _read_parameters(folder: Path, size: tuple[int, int]) -> _Parameters:
@@ -120,28 +96,27 @@ def _read_parameters(folder: Path, size: tuple[int, int]) -> _Parameters:
     if file is None:
         note = default_intrinsics(_PUBLISHED, size, _PUBLISHED_SIZE, _PARAMETERS)
         return _Parameters(_PUBLISHED, _PER_METRE, (f"{note}, and {_PER_METRE} depth counts per metre",))
-    values = read_json(file, "the camera of the recording").get("camera", {})
-    number = lambda key: float(schema.numbers(file, values, key))
-    width, height, fx, fy, cx, cy = map(number, ("w", "h", "fx", "fy", "cx", "cy"))
-    per_metre = number("scale") if "scale" in values else _PER_METRE
+    camera = read_json(file, "the camera").get("camera")
+    fx, fy, cx, cy, width, height = (
+        float(numbers(file, camera, key)) for key in ("fx", "fy", "cx", "cy", "w", "h")
+    )
+    scaled = isinstance(camera, dict) and "scale" in camera
+    per_metre = float(numbers(file, camera, "scale", above=0)) if scaled else _PER_METRE
     if (width, height) != size:
         raise DataError(
             f"{file}: expected the size of the images, {size[0]}x{size[1]}, got {width:g}x{height:g}"
         )
-    if not 0 < per_metre < math.inf:
-        raise DataError(f"{file}: expected a positive scale, got {per_metre}")
     K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     return _Parameters(check_intrinsics(file, K, size), per_metre, ())
 
 
-def _read_poses(file: Path, numbers: list[int]) -> tuple[Float[np.ndarray, "n 4 4"] | None, tuple[str, ...]]:
-    """Ground truth by frame number, and notes on what is missing or was repaired."""
+def _read_poses(file: Path, frames: list[int]) -> Poses:
+    """Ground truth by frame number."""
     if not file.is_file():
-        return None, ("no traj.txt: there is no ground truth to compare with",)
+        return Poses(None, str, missing="no traj.txt")
     lines, rows = read_numbers(file, "16 numbers (a 4x4 pose, row by row)", (16,), finite=False)
-    poses = np.full((len(numbers), 4, 4), np.nan)
-    for i, number in enumerate(numbers):
+    poses = np.full((len(frames), 4, 4), np.nan)
+    for i, number in enumerate(frames):
         if number < len(rows):
             poses[i] = rows[number].reshape(4, 4)
-    names = [f"{number:06d}" for number in numbers]
-    return usable_poses(poses, names, lambda i: f"{file}:{lines[numbers[i]]}", "none, NaN or infinity")
+    return Poses(poses, lambda i: f"{file}:{lines[frames[i]]}")

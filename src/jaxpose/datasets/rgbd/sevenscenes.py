@@ -5,43 +5,28 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from jaxpose.datasets.images import (
     INTRINSICS,
     Pinhole,
-    check_depth,
-    common_size,
+    check_intrinsics,
     default_intrinsics,
     found,
     frame_times,
     name_of,
     only,
-    read_color,
-    read_depth,
     read_intrinsics,
     read_matrix,
     sidecar,
-    some,
-    usable_poses,
-    within,
 )
-from jaxpose.datasets.types import Frame, Recording
+from jaxpose.datasets.rgbd.frames import Poses, of_files, pair_numbered, visible
+from jaxpose.datasets.types import Recording
 from jaxpose.errors import DataError
-from jaxpose.geometry.camera import Camera
+from jaxpose.geometry.camera import Camera, resized
 
-_FRAME = re.compile(r"frame-(\d{6})\.(color\.png|color\.jpg|depth\.png|pose\.txt)")
+_FRAME = re.compile(r"frame-(\d{6})\.(color|depth|pose)\.(png|jpg|jpeg|txt)", re.IGNORECASE)
 _LAYOUT = "frame-NNNNNN.color.png (or .jpg) with frame-NNNNNN.depth.png"
 _PUBLISHED, _PUBLISHED_SIZE = Pinhole(585.0, 585.0, 320.0, 240.0), (640, 480)
-
-
-class _Files(NamedTuple):
-    """The files of one frame."""
-
-    number: int
-    color: Path
-    depth: Path
-    pose: Path | None
 
 
 def detect(path: Path) -> bool:
@@ -58,10 +43,11 @@ def detect(path: Path) -> bool:
 
 
 def load(path: Path | str, *, rate_hz: float = 30.0) -> Recording:
-    """Read a sequence of 7-Scenes.
+    """Read a sequence of 7-Scenes, or of BundleFusion, which has the same files and `info.txt`.
 
-    Depth [m] is 0 where the sensor gave none (0 or 65535 mm). Poses are optional: one with NaN or infinity,
-    or missing while others are there, is a ground truth of NaN. Images are read when asked for.
+    Intrinsics are those of `camera-intrinsics.txt` (3x3) in or beside the sequence, else of `info.txt`, else
+    as published. Depth [m] is 0 where the sensor gave none (0 or 65535 mm). Poses are optional: one with NaN
+    or infinity, or missing while others are there, is a ground truth of NaN.
 
     Args:
         path: The sequence folder, or one that holds a single `seq-*`.
@@ -76,64 +62,76 @@ def load(path: Path | str, *, rate_hz: float = 30.0) -> Recording:
         ValueError: For a rate that is not positive.
     """
     folder = _sequence_folder(Path(path))
-    frames, skipped = _list_frames(folder)
-    t = frame_times([frame.number for frame in frames], rate_hz)
-    size = common_size([file for frame in frames for file in (frame.color, frame.depth)])
-    pinhole, assumed = _intrinsics(folder, size)
-    check_depth(folder, [frame.depth for frame in frames])
-    read_color(frames[0].color)
-    poses, repaired = _read_poses(frames)
-    return Recording(
-        name=name_of(folder),
-        camera=Camera(*pinhole, *size),
-        t=t,
-        read=lambda i: Frame(read_color(frames[i].color), read_depth(frames[i].depth)),
-        T_world_cam=poses,
-        notes=(*skipped, *assumed, *repaired),
-        files=within([frame.color for frame in frames], path),
-    )
+    files: dict[str, dict[int, Path]] = {"color": {}, "depth": {}, "pose": {}}
+    # Sorted, so that of two colour images of a frame the png, which has lost nothing, comes last and stays.
+    for file in sorted(visible(folder), key=lambda file: (file.suffix.lower() == ".png", file.name)):
+        if match := _FRAME.fullmatch(file.name):
+            files[match[2].lower()][int(match[1])] = file
+    pairs = pair_numbered(folder, _LAYOUT, files["color"], files["depth"], found(folder))
+    info = _read_info(folder)
+    none = np.full((4, 4), np.nan)
+    where = [files["pose"].get(number) for number in pairs.numbers]
+    poses = np.stack([none if file is None else read_matrix(file, 4) for file in where])
+    return of_files(
+        path,
+        pairs.colors,
+        pairs.depths,
+        lambda size, depth_size: _intrinsics(folder, info, size, depth_size),
+        t=frame_times(pairs.numbers, rate_hz),
+        names=[f"{number:06d}" for number in pairs.numbers],
+        poses=Poses(poses, lambda i: str(where[i])),
+        per_metre=1000.0 if info is None else info.per_metre,
+        notes=pairs.notes,
+    )._replace(name=name_of(folder))
+
+
+class _Info(NamedTuple):
+    """What BundleFusion's `info.txt` says of depth, to which colour is registered."""
+
+    file: Path
+    camera: Camera
+    per_metre: float
+
+
+def _read_info(folder: Path) -> _Info | None:
+    """BundleFusion's lines of `m_key = numbers`; None without the file."""
+    file = folder / "info.txt"
+    if not file.is_file():
+        return None
+    pairs = (line.partition("=")[::2] for line in file.read_text("utf-8-sig", "replace").splitlines())
+    values = {key.strip(): value.split() for key, value in pairs}
+    try:
+        matrix = np.array(values["m_calibrationDepthIntrinsic"], np.float64).reshape(-1, 4)[:3, :3]
+        size = int(values["m_depthWidth"][0]), int(values["m_depthHeight"][0])
+        per_metre = float(values["m_depthShift"][0])
+    except (KeyError, ValueError, IndexError) as error:
+        keys = "m_calibrationDepthIntrinsic, m_depthWidth, m_depthHeight and m_depthShift"
+        raise DataError(f"{file}: expected {keys}, got {type(error).__name__} {error}") from None
+    if not 0 < per_metre < np.inf:
+        raise DataError(f"{file}: expected a positive m_depthShift, got {per_metre:g}")
+    return _Info(file, Camera(*check_intrinsics(file, matrix, size), *size), per_metre)
 
 
 def _sequence_folder(path: Path) -> Path:
     """The folder that holds the frames."""
     if not path.is_dir():
         raise DataError(f"{path}: expected a folder of {_LAYOUT}, got {found(path)}")
-    if any(_FRAME.fullmatch(file.name) for file in path.iterdir()):
+    if any(_FRAME.fullmatch(file.name) for file in visible(path)):
         return path
     sequences = sorted(folder for folder in path.glob("seq-*") if folder.is_dir())
     return only(sequences, path, f"{_LAYOUT}, or one folder seq-* of them", "sequences")
 
 
-def _list_frames(folder: Path) -> tuple[list[_Files], tuple[str, ...]]:
-    """Frames that have colour and depth, in order, and a note on those that lack one."""
-    by_number: dict[int, dict[str, Path]] = {}
-    # Sorted, so that of two colour images of a frame the png, which has lost nothing, comes last and stays.
-    for file in sorted(folder.iterdir(), key=lambda file: (file.name.endswith("png"), file.name)):
-        if match := _FRAME.fullmatch(file.name):
-            by_number.setdefault(int(match[1]), {})[match[2].split(".")[0]] = file
-    frames, lacking = [], []
-    for number, files in sorted(by_number.items()):
-        missing = [kind for kind in ("color", "depth") if kind not in files]
-        if missing:
-            lacking.append(f"{number:06d} has no {' and no '.join(missing)}")
-        else:
-            frames.append(_Files(number, files["color"], files["depth"], files.get("pose")))
-    if not frames:
-        raise DataError(f"{folder}: expected {_LAYOUT}, got {some(lacking)}")
-    return frames, (f"{len(lacking)} frames skipped: {some(lacking)}",) if lacking else ()
-
-
-def _intrinsics(folder: Path, size: tuple[int, int]) -> tuple[Pinhole, tuple[str, ...]]:
-    """Those of the file in or beside the sequence, else as published, with a note."""
+def _intrinsics(
+    folder: Path, info: _Info | None, size: tuple[int, int], depth_size: tuple[int, int]
+) -> tuple[Pinhole | Camera, tuple[str, ...]]:
+    """Those of the file in or beside the sequence, else of `info.txt`, else as published, with a note."""
     file = sidecar(folder, INTRINSICS)
-    if file is None:
-        return _PUBLISHED, (default_intrinsics(_PUBLISHED, size, _PUBLISHED_SIZE, INTRINSICS),)
-    return read_intrinsics(file, size), ()
-
-
-def _read_poses(frames: list[_Files]) -> tuple[Float[np.ndarray, "n 4 4"] | None, tuple[str, ...]]:
-    """Ground truth, and notes on what is missing or was repaired."""
-    none = np.full((4, 4), np.nan)
-    poses = [none if frame.pose is None else read_matrix(frame.pose, 4) for frame in frames]
-    names = [f"{frame.number:06d}" for frame in frames]
-    return usable_poses(np.stack(poses), names, lambda i: str(frames[i].pose), "none, NaN or infinity")
+    if file is not None:
+        return read_intrinsics(file, size), ()
+    if info is not None:
+        if (info.camera.width, info.camera.height) != depth_size:
+            stated, got = (f"{w}x{h}" for w, h in (info.camera[4:6], depth_size))
+            raise DataError(f"{info.file}: expected the size of the depth images, {got}, got {stated}")
+        return resized(info.camera, *size), ()
+    return _PUBLISHED, (default_intrinsics(_PUBLISHED, size, _PUBLISHED_SIZE, INTRINSICS),)

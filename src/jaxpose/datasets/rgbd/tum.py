@@ -10,24 +10,20 @@ from jaxtyping import Float
 from jaxpose.datasets.images import (
     INTRINSICS,
     Pinhole,
-    check_depth,
+    check_intrinsics,
     check_positive,
-    common_size,
     default_intrinsics,
     found,
-    name_of,
-    read_color,
-    read_depth,
     read_intrinsics,
     sidecar,
-    usable_poses,
-    within,
 )
+from jaxpose.datasets.rgbd.frames import Poses, listed, of_files
 from jaxpose.datasets.rgbd.pairs import nearest_pairs, unpaired_note
-from jaxpose.datasets.types import Accelerometer, Frame, Recording
+from jaxpose.datasets.types import Accelerometer, Recording
 from jaxpose.errors import DataError
-from jaxpose.files.tables import numbered_lines, read_numbers, read_stamped_names, seconds
+from jaxpose.files.tables import numbered_lines, read_all_numbers, read_numbers, read_stamped_names
 from jaxpose.files.trajectories import nearest, read_trajectory
+from jaxpose.geometry import rigid
 from jaxpose.geometry.camera import Camera
 from jaxpose.imu import GRAVITY_WORLD
 from jaxpose.imu.gravity import gravity_note
@@ -35,6 +31,21 @@ from jaxpose.imu.gravity import gravity_note
 _SIZE = (640, 480)
 _NOMINAL = Pinhole(525.0, 525.0, 319.5, 239.5)
 _R_CAM_KINECT = np.diag([-1.0, -1.0, 1.0])
+# Bonn's marker and camera (Palazzolo et al. 2019, the data set's page): the world of its ground truth is
+# turned by the first on both sides, and the second, which is no rotation to 6%, is the camera on the markers.
+_BONN = (
+    Pinhole(542.822841, 542.57687, 315.59352, 237.756098),
+    (0.039903, -0.099343, -0.00073, -0.000144, 0.0),
+)
+_BONN_TURN = np.array([[-1.0, 0, 0, 0], [0, 0, 1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+_BONN_MARKER = np.array(
+    [
+        [1.0157, 0.1828, -0.2389, 0.0113],
+        [0.0009, -0.8431, -0.6413, -0.0098],
+        [-0.3009, 0.6147, -0.8085, 0.0111],
+        [0, 0, 0, 1],
+    ]
+)
 # By the data set's three cameras: the colour camera's intrinsics, and k1 k2 p1 p2 k3 of its lens.
 _CAMERAS: dict[str, tuple[Pinhole, tuple[float, ...]]] = {
     "1": (Pinhole(517.3, 516.5, 318.6, 255.3), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
@@ -44,15 +55,21 @@ _CAMERAS: dict[str, tuple[Pinhole, tuple[float, ...]]] = {
 
 
 class Stamped(NamedTuple):
-    """A list of images."""
+    """A list of images, those that are there."""
 
     ns: list[int]  # timestamps, increasing, on the file's own clock
     files: list[Path]
+    notes: tuple[str, ...]  # on those that are not
 
     @property
     def t(self) -> Float[np.ndarray, " n"]:
         """The timestamps [s]."""
         return np.array(self.ns, np.float64) / 1e9
+
+    @property
+    def names(self) -> list[str]:
+        """The files' own names."""
+        return [file.name for file in self.files]
 
 
 def detect(path: Path) -> bool:
@@ -68,16 +85,18 @@ def detect(path: Path) -> bool:
 
 
 def load(path: Path | str, *, max_difference_s: float = 0.02, depth_per_metre: float = 5000.0) -> Recording:
-    """Read a sequence of TUM RGB-D.
+    """Read a sequence of TUM RGB-D, or of Bonn or ETH3D, which have its files.
 
-    Colour and depth are paired one to one, nearest first; frames have the timestamps of colour. The true pose
-    is the one nearest in time, NaN where none is near enough; without `groundtruth.txt` there is no ground
-    truth, and of lines with one timestamp (the published fr2_desk has two) the first counts. Intrinsics (3x3)
-    are read from `camera-intrinsics.txt` in or beside the folder; else they and the distortion are the
-    published ones of freiburg1, 2 or 3, by the folder's name. Depth is registered to colour.
-    `accelerometer.txt` (m/s^2) is the Kinect's own, whose axes are left, up and forward (Microsoft's Kinect
-    documentation, "Accelerometer"): without ground truth it says which way is up; a note says if it disagrees
-    with the ground truth.
+    Listed images that are not there are skipped and counted. Colour and depth are paired one to one, nearest
+    first; frames have the timestamps of colour. The true pose is the one nearest in time, NaN where none
+    is near enough; without `groundtruth.txt` there is no ground truth, and of lines with one timestamp
+    (the published fr2_desk has two) the first counts. Intrinsics (3x3) are read from
+    `camera-intrinsics.txt` in or beside the folder, else from ETH3D's `calibration.txt` (fx fy cx cy);
+    else they and the distortion are the published ones of freiburg1, 2 or 3, or of Bonn's camera, by the
+    folder's name. Bonn's poses are of its markers, and are brought to the camera as its page says. Depth
+    is registered to colour. `accelerometer.txt` (m/s^2) is the Kinect's own, whose axes are left, up and
+    forward (Microsoft's Kinect documentation, "Accelerometer"): without ground truth it says which way is
+    up; a note says if it disagrees with the ground truth.
 
     Args:
         path: The sequence folder.
@@ -99,32 +118,28 @@ def load(path: Path | str, *, max_difference_s: float = 0.02, depth_per_metre: f
         raise DataError(f"{folder}: expected a folder with rgb.txt and depth.txt, got {found(folder)}")
     color, depth = read_list(folder / "rgb.txt"), read_list(folder / "depth.txt")
     rows, partners = nearest_pairs(str(folder), color.t, depth.t, max_difference_s)
+    notes = [*color.notes, *depth.notes]
+    notes += unpaired_note("colour", "depth", color.names, rows, max_difference_s)
+    notes += unpaired_note("depth", "colour", depth.names, partners, max_difference_s)
     ns = [color.ns[row] for row in rows]
-    t, t0_ns = seconds(ns, ns[0]), ns[0]
-    colors, depths = [color.files[i] for i in rows], [depth.files[i] for i in partners]
-    size = common_size([*colors, *depths])
-    pinhole, lens, assumed = _camera(folder, size)
-    check_depth(folder, depths, depth_per_metre)
-    read_color(colors[0])
-    poses, lacking = _truth(folder / "groundtruth.txt", color.t[rows], max_difference_s)
-    notes = [*unpaired_note("colour", "depth", _names(color), rows, max_difference_s)]
-    notes += [
-        *unpaired_note("depth", "colour", _names(depth), partners, max_difference_s),
-        *assumed,
-        *lacking,
-    ]
-    accelerometer, weighed = _accelerometer(folder / "accelerometer.txt", t0_ns, t, poses)
-    return Recording(
-        name=name_of(folder),
-        camera=Camera(*pinhole, *size, lens),
-        t=t,
-        read=lambda i: Frame(read_color(colors[i]), read_depth(depths[i], depth_per_metre)),
-        T_world_cam=poses,
-        accelerometer=accelerometer,
-        notes=(*notes, *weighed),
-        t0_ns=t0_ns,
-        files=within(colors, path),
+    poses, repeated = _truth(folder / "groundtruth.txt", color.t[rows], max_difference_s)
+    if poses.T_world_cam is not None and _is_bonn(folder):
+        poses = poses._replace(T_world_cam=poses.T_world_cam @ _bonn_camera())
+    recording = of_files(
+        path,
+        [color.files[row] for row in rows],
+        [depth.files[i] for i in partners],
+        lambda size, depth_size: _camera(folder, size),
+        t=ns,
+        names=[f"{t:.6f}" for t in color.t[rows]],
+        poses=poses,
+        per_metre=depth_per_metre,
+        notes=notes,
     )
+    accelerometer, weighed = _accelerometer(
+        folder / "accelerometer.txt", ns[0], recording.t, recording.T_world_cam
+    )
+    return recording._replace(accelerometer=accelerometer, notes=(*recording.notes, *repeated, *weighed))
 
 
 def read_list(file: Path) -> Stamped:
@@ -134,51 +149,62 @@ def read_list(file: Path) -> Stamped:
         file: Names are relative to its folder, timestamps increase.
 
     Returns:
-        Timestamps and image files.
+        Timestamps and image files of those that are there.
 
     Raises:
-        DataError: Naming file and line for anything else.
+        DataError: Naming file and line for anything else, and where none is there.
     """
     if not file.is_file():
         raise DataError(f"{file}: expected lines of a timestamp and a file name, got {found(file)}")
     ns, names = read_stamped_names(file, unit="s")
-    return Stamped(ns, [file.parent / name for name in names])
+    rows, files, notes = listed(file, file.parent, names)
+    return Stamped([ns[row] for row in rows], files, notes)
 
 
-def _names(images: Stamped) -> list[str]:
-    return [file.name for file in images.files]
+def _is_bonn(folder: Path) -> bool:
+    return "rgbd_bonn_" in folder.resolve().name.lower()
 
 
-def _camera(folder: Path, size: tuple[int, int]) -> tuple[Pinhole, tuple[float, ...], tuple[str, ...]]:
-    """Intrinsics, lens, and a note where they are assumed."""
+def _bonn_camera() -> Float[np.ndarray, "4 4"]:
+    """The camera on Bonn's markers."""
+    T = _BONN_TURN @ _BONN_MARKER
+    return rigid.make(rigid.nearest_rotation(T[:3, :3]), T[:3, 3])
+
+
+def _camera(folder: Path, size: tuple[int, int]) -> tuple[Camera, tuple[str, ...]]:
+    """Intrinsics and lens, and a note where they are assumed."""
     file = sidecar(folder, INTRINSICS)
     if file is not None:
-        return read_intrinsics(file, size), (), ()
+        return Camera(*read_intrinsics(file, size), *size), ()
+    if (file := folder / "calibration.txt").is_file():
+        fx, fy, cx, cy = read_all_numbers(file, (4,), "fx fy cx cy")
+        K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+        return Camera(*check_intrinsics(file, K, size), *size), ()
+    if _is_bonn(folder):
+        note = () if size == _SIZE else (default_intrinsics(_BONN[0], size, _SIZE, INTRINSICS),)
+        return Camera(*_BONN[0], *size, _BONN[1]), note
     match = re.search(r"(?<![a-z])(?:freiburg|fr)([123])(?!\d)", folder.resolve().name.lower())
     pinhole, lens = _CAMERAS[match[1]] if match else (_NOMINAL, ())
     if match and size == _SIZE:
-        return pinhole, lens, ()
+        return Camera(*pinhole, *size, lens), ()
     without = INTRINSICS if match else f"{INTRINSICS}, and no freiburg1, 2 or 3 in the folder's name"
-    return pinhole, lens, (default_intrinsics(pinhole, size, _SIZE, without),)
+    return Camera(*pinhole, *size, lens), (default_intrinsics(pinhole, size, _SIZE, without),)
 
 
-def _truth(
-    file: Path, timestamps: Float[np.ndarray, " n"], limit: float
-) -> tuple[Float[np.ndarray, "n 4 4"] | None, tuple[str, ...]]:
-    """The true poses nearest in time, and a note on frames without."""
+def _truth(file: Path, timestamps: Float[np.ndarray, " n"], limit: float) -> tuple[Poses, tuple[str, ...]]:
+    """The true poses nearest in time, and a note on lines that count for nothing."""
     if not file.is_file():
-        return None, ("no groundtruth.txt: there is no ground truth to compare with",)
+        return Poses(None, str, missing="no groundtruth.txt"), ()
     ground_truth, form, _, repeated = read_trajectory(file)
     if form != "TUM":
         raise DataError(f"{file}: expected lines of t tx ty tz qx qy qz qw, got a {form} file")
     row = nearest(timestamps, ground_truth.t)
     near = np.abs(ground_truth.t[row] - timestamps) < limit
     poses = np.where(near[:, None, None], ground_truth.T[row], np.nan)
-    names = [f"{t:.6f}" for t in timestamps]
-    checked, notes = usable_poses(poses, names, lambda i: str(file), f"none within {limit:g} s")
+    notes = ()
     if repeated:
-        notes += (f"{repeated} lines of groundtruth.txt repeat the timestamp before them and are ignored",)
-    return checked, notes
+        notes = (f"{repeated} lines of groundtruth.txt repeat the timestamp before them and are ignored",)
+    return Poses(poses, lambda i: str(file), f"none within {limit:g} s"), notes
 
 
 def _accelerometer(

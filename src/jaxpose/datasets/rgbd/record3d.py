@@ -1,0 +1,215 @@
+"""Record3D's `.r3d` of a phone: a zip of `metadata` (JSON) and of `rgbd/N.jpg`, `N.depth` and `N.conf`."""
+
+import io
+import re
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from jaxpose.datasets.images import Pinhole, check_intrinsics, found, some
+from jaxpose.datasets.photos.common import OPENGL
+from jaxpose.datasets.rgbd.frames import Images, Poses, assembled, visible
+from jaxpose.datasets.rgbd.phones import UNSURE, Y_UP, middle, sure
+from jaxpose.datasets.types import Recording
+from jaxpose.errors import DataError
+from jaxpose.files.schema import numbers
+from jaxpose.files.untrusted import read_json
+from jaxpose.geometry import rigid
+from jaxpose.geometry.camera import Camera, resized
+
+EXTRA = 'pip install "jaxpose[phone]"'
+_ENTRY = re.compile(r"rgbd/(\d+)\.(jpg|depth|conf)")
+_MOST_BYTES = 1 << 28  # of an entry
+
+
+class _Source(NamedTuple):
+    """An archive, or the folder of an unpacked one."""
+
+    path: Path
+    names: list[str]
+    read: Callable[[str], bytes]
+    content: dict[str, Any]  # of `metadata`
+
+
+def detect(path: Path) -> bool:
+    """Whether a path is an archive of Record3D, or an unpacked one.
+
+    Args:
+        path: A file or folder.
+
+    Returns:
+        Whether `load` should read it.
+    """
+    if path.is_dir():
+        return (path / "metadata").is_file() and (path / "rgbd").is_dir()
+    return path.suffix.lower() == ".r3d" and path.is_file()
+
+
+def load(path: Path | str) -> Recording:
+    """Read a video of Record3D. Its depth, where compressed, needs the package lzfse (extra `phone`).
+
+    Nothing is unpacked to disk. Poses are ARKit's, quaternion xyzw and position, of a camera with OpenGL's
+    axes that is turned as the images are; its world's y points up. Intrinsics are the median of those of each
+    frame, where there are any, else K, column by column. Depth is in metres, 0 where the confidence is 0;
+    colour is resized to it. Times are `frameTimestamps`, else those of `fps`.
+
+    Args:
+        path: The `.r3d`, or the folder of an unpacked one.
+
+    Returns:
+        The recording; its notes say what was left out or assumed.
+
+    Raises:
+        DataError: Naming the file for anything that cannot be used.
+    """
+    source = _open(Path(path))
+    entries: dict[str, set[int]] = {"jpg": set(), "depth": set(), "conf": set()}
+    for name in source.names:
+        if match := _ENTRY.fullmatch(name):
+            entries[match[2]].add(int(match[1]))
+    frames = sorted(entries["jpg"] & entries["depth"])
+    if not frames:
+        raise DataError(
+            f"{path}: expected rgbd/N.jpg with rgbd/N.depth, got {some(source.names) or 'nothing'}"
+        )
+    depth_side = lambda key: int(numbers(source.path, source.content, key, whole=True, least=1))
+    width, height = depth_side("dw"), depth_side("dh")
+    size = _decode(source, f"rgbd/{frames[0]}.jpg").size
+    images = Images(
+        size,
+        lambda i, to: _color(source, f"rgbd/{frames[i]}.jpg", to),
+        lambda i: _depth(source, frames[i], (height, width), frames[i] in entries["conf"]),
+        lambda i: f"{frames[i]}.depth",
+    )
+    lost = [str(frame) for frame in sorted(entries["jpg"] ^ entries["depth"])]
+    notes = [f"{len(lost)} frames left out, without colour or depth: {some(lost)}"] if lost else []
+    return assembled(
+        source.path,
+        images,
+        lambda size, depth_size: _intrinsics(source, frames, size),
+        t=_times(source, frames),
+        names=[str(frame) for frame in frames],
+        poses=_poses(source, frames),
+        first_color=f"{frames[0]}.jpg",
+        notes=(*notes, *([UNSURE] if entries["conf"] else [])),
+        gravity_world=Y_UP,
+    )
+
+
+def _open(path: Path) -> _Source:
+    if path.is_dir():
+        names = [f"rgbd/{file.name}" for file in visible(path / "rgbd")] if (path / "rgbd").is_dir() else []
+        read = lambda name: (path / name).read_bytes()
+        return _Source(path, names, read, read_json(path / "metadata", "the metadata of Record3D"))
+    if not path.is_file():
+        raise DataError(f"{path}: expected an archive of Record3D, got {found(path)}")
+    try:
+        archive = zipfile.ZipFile(path)
+        names = archive.namelist()
+    except (zipfile.BadZipFile, OSError, ValueError) as error:
+        raise DataError(f"{path}: expected an archive of Record3D (a zip), got {error}") from None
+
+    def read(name: str) -> bytes:
+        try:
+            if archive.getinfo(name).file_size > _MOST_BYTES:
+                raise ValueError(f"{archive.getinfo(name).file_size} bytes")
+            return archive.read(name)
+        except Exception as error:  # of many kinds, for damaged and for encrypted archives
+            words = " ".join(str(error).split()) or type(error).__name__
+            raise DataError(
+                f"{path}: {name}: expected an entry that can be read, got {words[:200]}"
+            ) from None
+
+    import json
+
+    try:
+        content = json.loads(read("metadata"))
+        if not isinstance(content, dict):
+            raise ValueError(f"{str(content)[:40]!r}")
+    except ValueError as error:
+        raise DataError(f"{path}: metadata: expected an object in JSON, got {error}") from None
+    return _Source(path, names, read, content)
+
+
+def _decode(source: _Source, name: str) -> Image.Image:
+    data = source.read(name)
+    try:
+        with Image.open(io.BytesIO(data)) as image:
+            return image.convert("RGB")
+    except Exception as error:  # Pillow raises many kinds on damaged images
+        words = " ".join(str(error).split()) or type(error).__name__
+        raise DataError(f"{source.path}: {name}: expected an image, got {words[:200]}") from None
+
+
+def _color(source: _Source, name: str, to: tuple[int, int] | None) -> np.ndarray:
+    image = _decode(source, name)
+    return np.asarray(image if to is None else image.resize(to, Image.Resampling.BILINEAR))
+
+
+def _depth(source: _Source, frame: int, shape: tuple[int, int], has_confidence: bool) -> np.ndarray:
+    depth = _plane(source, f"rgbd/{frame}.depth", np.dtype("<f4"), shape)
+    depth = np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
+    if not has_confidence:
+        return depth
+    name = f"rgbd/{frame}.conf"
+    return sure(depth, _plane(source, name, np.dtype(np.uint8), shape), f"{source.path}: {name}")
+
+
+def _plane(source: _Source, name: str, kind: np.dtype, shape: tuple[int, int]) -> np.ndarray:
+    """An array of bytes, compressed by LZFSE or not."""
+    data, size = source.read(name), shape[0] * shape[1] * kind.itemsize
+    if len(data) != size:
+        try:
+            import lzfse
+        except ImportError:
+            raise DataError(f"{source.path}: compressed depth needs the package lzfse: {EXTRA}") from None
+        try:
+            data = lzfse.decompress(data)
+        except Exception as error:
+            raise DataError(f"{source.path}: {name}: expected LZFSE, got {error}") from None
+    if len(data) != size:
+        wanted = f"{shape[1]}x{shape[0]} of {kind.name}, {size} bytes"
+        raise DataError(f"{source.path}: {name}: expected {wanted}, got {len(data)}")
+    return np.frombuffer(data, kind).reshape(shape)
+
+
+def _intrinsics(source: _Source, frames: list[int], size: tuple[int, int]) -> tuple[Pinhole, tuple[str, ...]]:
+    """Those for images of a size, scaled from the size that the metadata state."""
+    path, content = source.path, source.content
+    w, h = (float(numbers(path, content, key, above=0)) for key in ("w", "h"))
+    if content.get("perFrameIntrinsicCoeffs"):
+        each = numbers(path, content, "perFrameIntrinsicCoeffs", (None, 4))
+        pinhole, notes = middle(each[[min(frame, len(each) - 1) for frame in frames]])
+    else:
+        K, notes = numbers(path, content, "K", (9,)).reshape(3, 3).T, ()
+        pinhole = check_intrinsics(path, K, (int(w), int(h)))
+    scaled = resized(Camera(*pinhole, int(w), int(h)), *size)
+    return Pinhole(*scaled[:4]), notes
+
+
+def _poses(source: _Source, frames: list[int]) -> Poses:
+    if not source.content.get("poses"):
+        return Poses(None, str)
+    stated = numbers(source.path, source.content, "poses", (None, 7))
+    T = np.full((len(frames), 4, 4), np.nan)
+    for row, frame in enumerate(frames):
+        if frame < len(stated) and abs(np.linalg.norm(stated[frame, :4]) - 1) < 1e-2:
+            T[row] = rigid.make(Rotation.from_quat(stated[frame, :4]).as_matrix(), stated[frame, 4:]) @ OPENGL
+    return Poses(T, lambda i: f"{source.path}: pose {frames[i]}", "none, or no quaternion")
+
+
+def _times(source: _Source, frames: list[int]) -> list[int]:
+    """Timestamps [ns]."""
+    path, content = source.path, source.content
+    if content.get("frameTimestamps"):
+        stated = numbers(path, content, "frameTimestamps", (None,))
+        if len(stated) <= frames[-1] or (np.diff(stated[frames]) <= 0).any():
+            raise DataError(f"{path}: frameTimestamps: expected one a frame, increasing, got {len(stated)}")
+        return [round(t * 1e9) for t in stated[frames].tolist()]
+    fps = float(numbers(path, content, "fps", above=0))
+    return [round(frame / fps * 1e9) for frame in frames]

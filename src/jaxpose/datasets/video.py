@@ -1,0 +1,76 @@
+"""Videos (mp4, mkv) through PyAV: frames decoded when asked for."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxpose.errors import DataError
+
+EXTRA = 'pip install "jaxpose[video]"'
+_NEAR = 8  # frames ahead that are decoded on the way instead of sought
+
+
+class Video:
+    """The first video track of a file. Needs the package av (extra `video`).
+
+    Args:
+        path: The file.
+
+    Raises:
+        DataError: For what is no video, or of a codec that is not there, and without the package.
+    """
+
+    def __init__(self, path: Path):
+        self.path = path
+        try:
+            import av
+        except ImportError:
+            raise DataError(f"{path}: a video needs the package av: {EXTRA}") from None
+        try:
+            with av.open(str(path)) as container:
+                stamps = [packet.pts for packet in container.demux(video=0) if packet.pts is not None]
+            self._container = av.open(str(path))
+            self._stream = self._container.streams.video[0]
+            self._stream.thread_type = "AUTO"
+            self.size = (self._stream.codec_context.width, self._stream.codec_context.height)
+        except Exception as error:  # PyAV raises many kinds
+            raise self._damaged(error) from None
+        if not stamps or min(self.size) < 1:
+            raise DataError(f"{path}: expected a video with frames, got none")
+        self._pts = sorted(set(stamps))
+        self._rank = {pts: i for i, pts in enumerate(self._pts)}
+        self._next, self._frames = len(self._pts), iter(())
+
+    def __len__(self) -> int:
+        return len(self._pts)
+
+    def read(self, i: int, size: tuple[int, int] | None = None) -> np.ndarray:
+        """Frame i as (height, width, 3) uint8 RGB, resized by area to `size` (width, height) if given."""
+        try:
+            if not self._next <= i < self._next + _NEAR:
+                self._container.seek(self._pts[i], stream=self._stream)
+                self._frames = self._decoded()
+            for at, frame in self._frames:
+                self._next = at + 1
+                if at == i:
+                    width, height = size or self.size
+                    resized = frame.reformat(width, height, "rgb24", interpolation="AREA")
+                    return resized.to_ndarray()
+                if at > i:
+                    break
+        except Exception as error:
+            raise self._damaged(error) from None
+        self._next = len(self._pts)
+        raise DataError(f"{self.path}: expected frame {i} of {len(self)}, got none that can be decoded")
+
+    def _decoded(self) -> Iterator[tuple[int, Any]]:
+        """Frames from where the file was sought on, and which each is."""
+        for frame in self._container.decode(self._stream):
+            if frame.pts in self._rank:
+                yield self._rank[frame.pts], frame
+
+    def _damaged(self, error: Exception) -> DataError:
+        words = " ".join(str(error).split()) or type(error).__name__
+        return DataError(f"{self.path}: expected a video, got {words[:200]}")
