@@ -22,7 +22,7 @@ from jaxpose.training import devices
 
 Precision = Literal["tensorfloat32", "float32", "bfloat16"]
 # What JAX calls them. The first is what it does by itself on a GPU.
-_PRODUCTS = {"tensorfloat32": None, "float32": "highest", "bfloat16": "BF16_BF16_F32"}
+PRODUCTS = {"tensorfloat32": None, "float32": "highest", "bfloat16": "BF16_BF16_F32"}
 _LEAVE_S, _HEARTBEAT_S = 30, 30  # that processes may end apart, and that one may be silent
 _AT_ONCE = 1024
 T = TypeVar("T")
@@ -189,7 +189,7 @@ def spread_over(job: Job, precision: Precision) -> Iterator[None]:
     Returns:
         Nothing, for the length of the `with` block.
     """
-    with jax.set_mesh(job.mesh), jax.default_matmul_precision(_PRODUCTS[precision]):
+    with jax.set_mesh(job.mesh), jax.default_matmul_precision(PRODUCTS[precision]):
         yield
 
 

@@ -22,7 +22,7 @@ _FAST_SCENE = NerfConfig(
 )
 _SMOKE_SCENE = NerfConfig(layers=2, width=16, skip=None, colour_width=8, octaves=4, window=(0.1, 0.5))
 _FAST = TrainConfig(steps=5000, rays=1024, samples=32, chunk=64)
-_PAPER = TrainConfig(steps=200_000, rays=4096, samples=128, chunk=32)
+PAPER = TrainConfig(steps=200_000, rays=4096, samples=128, chunk=32)
 _SMOKE = TrainConfig(steps=CHUNK, rays=64, samples=8, chunk=32)
 # In short trainings on poses far off: first a blurred scene forms, then the cameras move to where it is seen,
 # then they turn. Free at once, they run after a scene that does not exist yet, and do not come back.
@@ -62,7 +62,7 @@ def build(config: Config, problem: Problem) -> Model:
     if config.smoke:
         scene, train = nerf(_SMOKE_SCENE), _SMOKE
     else:
-        scene, train = (nerf(), _PAPER) if paper else (nerf(_fast_scene(config)), _FAST)
+        scene, train = (nerf(), PAPER) if paper else (nerf(_fast_scene(config)), _FAST)
         train = replace(train, steps=config.steps or train.steps, rays=config.rays or train.rays)
     train = replace(train, chunk=config.devices.chunk(train.chunk))
     scene_rate = Decay(5e-4 if paper and barf == "depth" else 1e-3, 1e-4)
