@@ -155,7 +155,7 @@ def files(tmp_path, monkeypatch):
         # of the wrong kind
         ("slam --data empty", "empty: expected a recording"),
         ("slam --data text.txt", "text.txt: expected a recording"),
-        ("nerf --data empty", "empty: expected transforms_train.json"),
+        ("nerf --data empty", "empty: expected photographs, with poses_bounds.npy"),
         ("events --data other.npz", "other.npz"),
         ("planar --image text.txt", "text.txt: expected an image"),
         ("check text.txt", "text.txt"),

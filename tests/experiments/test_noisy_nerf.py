@@ -5,6 +5,7 @@ import re
 from dataclasses import replace
 from functools import partial
 
+import imageio.v3 as imageio
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -78,6 +79,22 @@ def test_other_starts():
     independent = load(smoke(noise="independent", noise_sigma=0.01))
     assert 0 < np.abs(independent.T_start - none.T_start).max() < 0.2
     assert len(load(smoke(every=2)).train.t) == 4
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_pixels_without_mask_do_not_count(masked):
+    """A scene of one colour learns that colour, though half of each image shows another."""
+    problem = load(smoke(noise="none"))
+    rgb = np.full_like(problem.train.rgb, 255)
+    rgb[:, : rgb.shape[1] // 2] = 0
+    mask = np.zeros(rgb.shape[:3], bool)
+    mask[:, rgb.shape[1] // 2 :] = True
+    config = smoke(noise="none", pose="per_frame")
+    photographs = problem.train._replace(rgb=rgb, mask=mask if masked else None)
+    model = build(config, problem._replace(train=photographs))
+    state = model.trainer.start(jax.random.key(0))
+    state, losses = model.trainer.advance(state, model.views, 100)
+    assert (float(losses[-20:].mean()) < 0.06) == masked
 
 
 @pytest.mark.parametrize("pose", ["posenet", "per_frame", "bspline", "spline_reset"])
@@ -317,6 +334,31 @@ def test_unknown_places_of_a_forward_facing_scene_are_found_first(data_dir, tmp_
 def test_unknown_poses_of_a_forward_facing_scene_are_found(data_dir, tmp_path):
     results = fern_from_nothing(data_dir, tmp_path, 5000)
     assert results["translation_error_percent"] < 2.5 and results["rotation_error_deg"] < 6
+
+
+def test_photographs_without_poses(tmp_path):
+    """A run without ground truth: no errors of poses, the poses found as files, training views to look at."""
+    problem = load(smoke())
+    for i, rgb in enumerate(problem.train.rgb):
+        (tmp_path / "photos").mkdir(exist_ok=True)
+        imageio.imwrite(tmp_path / "photos" / f"p{i}.png", rgb)
+    data = tmp_path / "photos"
+    line = complaint("--data", data, "--out", tmp_path / "out", "--smoke")
+    assert "p0.png: expected a focal length in its EXIF, got none: --focal-px says it" in line
+    line = complaint("--data", data, "--out", tmp_path / "out", "--smoke", "--focal-px", "30")
+    assert "photos: expected poses for --noise correlated, got none: --noise unknown" in line
+    config = smoke(data=data, noise="unknown", focal_px=30.0, out=tmp_path / "out")
+    folder, results = noisy_nerf.run(config)
+    assert results["rotation_error_deg"] is None and results["start"]["centre_error"] is None
+    assert 0 < results["psnr"] < 60 and results["held_out"] == []
+    of_the_orbit = {"transforms_train.json", "transforms_test.json", "train", "held_out"}
+    expected = FILES - of_the_orbit - {"reference.txt", "held_out.png"} | {"training.png", "transforms.json"}
+    assert {path.name for path in folder.iterdir()} == expected
+    text = report(folder, results)
+    assert "n/a" in text and "no poses are known" in text and "nan" not in text
+    T = trajectories.read_tum(folder / "trajectory.txt").T
+    assert len(T) == 8 and json.loads((folder / "results.json").read_text())["data"]["extent"] is None
+    assert "trained on" in results["protocol"]["image_metrics"]
 
 
 # --- what is not possible --------------------------------------------------------------------------------

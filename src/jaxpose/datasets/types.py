@@ -5,9 +5,10 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from jaxpose._checks import check_increasing, check_shapes
+from jaxpose.datasets.photos.lens import Lens
 from jaxpose.errors import DataError
 from jaxpose.events import Events, Mosaic
 from jaxpose.geometry.camera import Camera
@@ -64,12 +65,14 @@ class Photographs(NamedTuple):
     camera: Camera
     t: Float[np.ndarray, " n"]  # [s], or the frame index where there are no timestamps, as `notes` then says
     rgb: UInt8[np.ndarray, "n h w 3"]  # on white where the file had alpha
-    T_world_cam: Float[np.ndarray, "n 4 4"]  # float64, finite
+    T_world_cam: Float[np.ndarray, "n 4 4"]  # float64, finite; all NaN where no pose is known
     near: float  # depth along the optical axis at which the scene begins and ends [scene units]
     far: float
     spacing: Literal["depth", "disparity"]  # what samples between near and far are equally spaced in
     files: tuple[str, ...]  # each image's name, as its source writes it
     notes: tuple[str, ...] = ()  # notes of the loader for the user
+    mask: Bool[np.ndarray, "n h w"] | None = None  # which pixels count; None: all
+    lenses: tuple[Lens, ...] = ()  # of the image files as they are on disk; empty: they are on none
 
 
 class EventRecording(NamedTuple):
@@ -259,6 +262,8 @@ def take(photographs: Photographs, indices: Int[np.ndarray, " m"]) -> Photograph
         rgb=photographs.rgb[indices],
         T_world_cam=photographs.T_world_cam[indices],
         files=tuple(photographs.files[i] for i in indices),
+        mask=None if photographs.mask is None else photographs.mask[indices],
+        lenses=tuple(photographs.lenses[i] for i in indices) if photographs.lenses else (),
     )
 
 

@@ -167,7 +167,9 @@ def pose_reader(field: PoseField, t: Float[np.ndarray, " n"]) -> Callable[[Any],
 def mean_errors(
     estimate: Float[np.ndarray, "n 4 4"], ground_truth: Float[np.ndarray, "n 4 4"]
 ) -> tuple[float, float]:
-    """Mean rotation [deg] and translation error after alignment, as `metrics.pose_errors`."""
+    """Mean rotation [deg] and translation error after alignment; NaN where no pose is known."""
+    if not np.isfinite(ground_truth).any():
+        return np.nan, np.nan
     found = trajectory_error.pose_errors(estimate, ground_truth)
     return found.rotation_deg, found.translation
 

@@ -55,7 +55,7 @@ class History(NamedTuple):
 
 def cameras(
     path: Path | str,
-    ground_truth: Float[np.ndarray, "n 4 4"],
+    ground_truth: Float[np.ndarray, "n 4 4"] | None,
     start: Float[np.ndarray, "n 4 4"],
     estimate: Float[np.ndarray, "n 4 4"],
     title: str,
@@ -67,42 +67,48 @@ def cameras(
 
     Args:
         path: PNG to write.
-        ground_truth: camera-to-world poses [scene units].
+        ground_truth: camera-to-world poses [scene units]; None: not known, so not drawn.
         start: poses before a training, aligned as their errors were computed.
         estimate: poses after it, aligned in the same way.
         title: of the figure.
     """
-    across, along, up, sign = view_axes(ground_truth)
+    place = estimate if ground_truth is None else ground_truth
+    across, along, up, sign = view_axes(place)
     order = [across, along, up]
     if np.linalg.det(np.eye(3)[order]) * sign < 0:
         order[:2] = along, across  # or the picture would be a mirror image
-    centres = ground_truth[:, :3, 3]
+    centres = place[:, :3, 3]
     extent = float(np.linalg.norm(centres - centres.mean(0), axis=1).max()) or 1.0
     length = _TICK * extent
     is_path = np.median(np.linalg.norm(np.diff(centres, axis=0), axis=1)) < _PATH_STEP * extent
-    shown = slice(None, None, -(-len(ground_truth) // _MOST_FRUSTA))
+    shown = slice(None, None, -(-len(place) // _MOST_FRUSTA))
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(11, 5.4), dpi=DPI, layout="constrained")
         panels: list[Any] = list(figure.subplots(1, 2, subplot_kw={"projection": "3d"}))
         for axes, poses, color, name in zip(
             panels, (start, estimate), (LOST, ESTIMATE), ("start", "estimate"), strict=True
         ):
-            joints = np.stack([poses[:, order, 3], ground_truth[:, order, 3]], axis=1)
-            joints = joints if is_path else joints[shown]
-            axes.add_collection3d(Line3DCollection(list(joints), colors=color, lw=0.8, alpha=0.35))
-            for T, shade, width in ((ground_truth, GROUND_TRUTH, 1.7), (poses, color, 0.9)):
+            drawn = [(poses, color, 0.9)]
+            if ground_truth is not None:
+                joints = np.stack([poses[:, order, 3], ground_truth[:, order, 3]], axis=1)
+                joints = joints if is_path else joints[shown]
+                axes.add_collection3d(Line3DCollection(list(joints), colors=color, lw=0.8, alpha=0.35))
+                drawn.insert(0, (ground_truth, GROUND_TRUTH, 1.7))
+            for T, shade, width in drawn:
                 if is_path:
                     axes.plot(*T[:, order, 3].T, color=shade, lw=width)
                 edges = _frusta(T[shown], length)[..., order]
                 axes.add_collection3d(Line3DCollection(list(edges), colors=shade, lw=width))
-            axes.set(title=f"{name} and ground truth")
-        _equal_axes(panels, np.concatenate([ground_truth, start, estimate])[:, order, 3], length, sign < 0)
+            axes.set(title=name if ground_truth is None else f"{name} and ground truth")
+        _equal_axes(panels, np.concatenate([place, start, estimate])[:, order, 3], length, sign < 0)
         for axes in panels:
             axes.set(xlabel=AXES[order[0]], ylabel=AXES[order[1]], zlabel=AXES[order[2]])
             axes.view_init(elev=28, azim=-58)
             axes.tick_params(labelsize=7)
             axes.locator_params(nbins=5)
-        colors = {"ground truth": GROUND_TRUTH, "start": LOST, "estimate": ESTIMATE}
+        colors = {"start": LOST, "estimate": ESTIMATE}
+        if ground_truth is not None:
+            colors = {"ground truth": GROUND_TRUTH, **colors}
         keys = [Line2D([], [], color=color, lw=1.6, label=name) for name, color in colors.items()]
         figure.legend(handles=keys, loc="outside lower center", ncols=3)
         figure.suptitle(title)

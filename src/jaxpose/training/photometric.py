@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt8
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt8
 
 from jaxpose import optim, render
 from jaxpose.fields import PoseField
@@ -43,10 +43,11 @@ class Depths(NamedTuple):
 
 
 class Views(NamedTuple):
-    """Training images and the times [s] at which their poses are asked for."""
+    """Training images, times [s] at which their poses are asked for, and pixels that count (None: all)."""
 
     t: Float[Array, " n"]
     rgb: UInt8[Array, "n h w 3"]
+    mask: Bool[Array, "n h w"] | None = None
 
 
 def trainer(
@@ -74,8 +75,8 @@ def trainer(
     """
 
     def error(scene_params, item):
-        ray, depth, rgb = item
-        return jnp.sum((ray_colour(scene, scene_params, ray, depth)[0] - rgb) ** 2)
+        ray, depth, rgb, weight = item
+        return weight * jnp.sum((ray_colour(scene, scene_params, ray, depth)[0] - rgb) ** 2)
 
     total = microbatched_sum(error, min(config.chunk, config.rays))
 
@@ -87,12 +88,14 @@ def trainer(
         # Once for every image, not for every ray.
         T_world_cam = jax.vmap(field.pose, (None, 0))(pose_params, views.t)[view]
         rays = jax.vmap(partial(pixel_ray, camera))(T_world_cam, pixel.astype(T_world_cam.dtype))
+        weight = _weights(views.mask, (view, pixel[:, 1], pixel[:, 0]), T_world_cam.dtype)
         batch = (
             rays,
             draw_depths(depth_key, depths, rays=config.rays, samples=config.samples),
             _unit(views.rgb[view, pixel[:, 1], pixel[:, 0]]),
+            weight,
         )
-        return total(scene_params, batch) / (3 * config.rays)
+        return total(scene_params, batch) / (3 * jnp.maximum(jnp.sum(weight), 1))
 
     return joint(loss, scene.init, field.init, optimizer, config.steps)
 
@@ -108,7 +111,10 @@ class RenderImage(Protocol):
 
 @runtime_checkable
 class RefinePose(Protocol):
-    """A camera-to-world pose moved, by a twist of the world, to where the scene explains an image."""
+    """A camera-to-world pose moved, by a twist of the world, to where the scene explains an image.
+
+    Pixels without mask (None: none) do not count.
+    """
 
     def __call__(
         self,
@@ -116,6 +122,7 @@ class RefinePose(Protocol):
         T_world_cam: Float[Array, "4 4"],
         rgb: UInt8[Array, "h w 3"],
         key: PRNGKeyArray,
+        mask: Bool[Array, "h w"] | None = None,
         /,
     ) -> Float[Array, "4 4"]: ...
 
@@ -164,10 +171,10 @@ def viewer(
         rgb, found = jax.lax.map(one, pixels.reshape(-1, 2), batch_size=config.chunk)
         return rgb.reshape(pixels.shape[0], -1, 3), found.reshape(pixels.shape[:2])
 
-    def refine_pose(scene_params, T_world_cam, rgb, key):
+    def refine_pose(scene_params, T_world_cam, rgb, key, mask=None):
         def error(_, item):
-            ray, depth, seen = item
-            return jnp.sum((colour(scene_params, ray, depth)[0] - seen) ** 2)
+            ray, depth, seen, weight = item
+            return weight * jnp.sum((colour(scene_params, ray, depth)[0] - seen) ** 2)
 
         total = microbatched_sum(error, min(config.chunk, config.rays))
 
@@ -175,12 +182,14 @@ def viewer(
             pixel_key, depth_key = jax.random.split(jax.random.fold_in(key, step))
             pixel = _pixels(pixel_key, config.rays, *rgb.shape[:2])
             moved = se3.compose(se3.exp(twist), T_world_cam)
+            weight = _weights(mask, (pixel[:, 1], pixel[:, 0]), moved.dtype)
             batch = (
                 jax.vmap(partial(pixel_ray, camera, moved))(pixel.astype(moved.dtype)),
                 draw_depths(depth_key, depths, rays=config.rays, samples=config.samples),
                 _unit(rgb[pixel[:, 1], pixel[:, 0]]),
+                weight,
             )
-            return total((), batch) / (3 * config.rays)
+            return total((), batch) / (3 * jnp.maximum(jnp.sum(weight), 1))
 
         still = jnp.zeros(6, T_world_cam.dtype)
         twist = optim.minimize(loss, still, refine_optimizer, refine_steps).params
@@ -227,6 +236,11 @@ def _pixels(key: PRNGKeyArray, count: int, height: int, width: int) -> Int[Array
     """Columns and rows, any as likely as any other."""
     pixel = jax.random.randint(key, (count,), 0, height * width)
     return jnp.stack([pixel % width, pixel // width], axis=-1)
+
+
+def _weights(mask: Any, at: tuple[Any, ...], dtype: Any) -> Float[Array, " rays"]:
+    """1 for pixels that count, 0 for others."""
+    return jnp.ones(at[0].shape, dtype) if mask is None else mask[at].astype(dtype)
 
 
 def draw_depths(

@@ -155,20 +155,18 @@ def _folder(path: Path, topics: Sequence[str]) -> tuple[str, Checked]:
     from jaxpose.datasets.rgbd import registry as rgbd_registry
 
     form = rgbd_registry.detect(path)
-    transforms = [path, path / "transforms_train.json", path / "transforms.json"]
-    file = next((file for file in transforms if file.is_file()), None)
+    photos = check_photographs.find_photographs(path)
     if events := check_events.find_events(path):
         return check_events.check_events(path, events)
-    if file is not None and form is None:
-        name = "Blender" if file.name == "transforms_train.json" else "nerfstudio, instant-ngp"
-        return f"photographs, {name} ({file.name})", check_photographs.check_photographs(path, "blender")
-    if (path / "poses_bounds.npy").is_file():
-        return "photographs, LLFF (poses_bounds.npy)", check_photographs.check_photographs(path, "llff")
+    if photos not in (None, "plain") and form is None:
+        return check_photographs.check_photographs(path, photos)
     if euroc.detect(path) and not check_inertial.has_depth(path):
         return "EuRoC, IMU and ground truth without depth", check_inertial.check_inertial(path)
     if form is not None:
         return f"RGB-D recording ({form})", check_recording.check_recording(path, form, topics)
     checked: Checked | None = check_trajectories(path)
+    if checked is None and photos is not None:
+        return check_photographs.check_photographs(path, photos)
     if checked is None:
         raise DataError(f"{path}: expected {_KNOWN}, got {rgbd_registry.nearest(path)}")
     return "folder of trajectories", checked

@@ -1,7 +1,6 @@
 """Checks of photographs with poses: the camera, and whether the cameras look where others look."""
 
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -9,42 +8,73 @@ from jaxtyping import Float
 from jaxpose.cli.check.findings import Checked, Fact, Finding, join, unusable
 from jaxpose.cli.check.poses import check_poses
 from jaxpose.cli.check.recording import check_camera
-from jaxpose.datasets.images import SUFFIXES, image_size
-from jaxpose.datasets.photos import blender, llff
+from jaxpose.datasets.photos import blender, colmap, registry
 from jaxpose.datasets.photos.common import OPENGL
+from jaxpose.datasets.photos.lens import as_camera
 from jaxpose.datasets.types import Photographs
 from jaxpose.errors import DataError
+from jaxpose.files.colmap import read_colmap
 from jaxpose.geometry import rigid
 
+_NAMES = {"llff": "LLFF (poses_bounds.npy)", "colmap": "COLMAP", "plain": "without poses"}
 _WIDTH = 8  # pixels: the images are decoded to see that they can be, and not kept
 _PARALLEL = 1e-2  # least share of the directions across the axes; less has no point in common
 _MEET = 0.3  # distance of an axis from the common point, over the distance to it
 
 
-def check_photographs(path: Path, layout: Literal["blender", "llff"]) -> Checked:
-    """Count, camera, extent and notes of photographs in one of the two layouts; where the cameras look."""
+def find_photographs(path: Path) -> registry.Format | None:
+    """The layout of the photographs that a folder or json file has; None if it has none."""
     try:
-        held = (blender if layout == "blender" else llff).load(path, width=_WIDTH)
+        return registry.find_format(path)
+    except DataError:
+        return None
+
+
+def check_photographs(path: Path, layout: registry.Format) -> tuple[str, Checked]:
+    """The layout in words, count, camera, extent and notes of photographs; where the cameras look."""
+    name = _NAMES[layout]
+    if layout == "transforms":
+        file = blender.transforms_file(path)
+        maker = "Blender" if file.name == "transforms_train.json" else "nerfstudio, instant-ngp"
+        name = f"{maker} ({file.name})"
+    return f"photographs, {name}", _checked(path, layout)
+
+
+def _checked(path: Path, layout: registry.Format) -> Checked:
+    try:
+        held = registry.load_photographs(path, layout, width=_WIDTH)
     except (DataError, OSError) as error:
-        return unusable(error)
+        return _model_alone(path, error) if layout == "colmap" else unusable(error)
     train = held[0]
     T = np.concatenate([part.T_world_cam for part in held])
-    folder = path.parent if path.is_file() else path
     text = f"{len(held[0].t)}, and {len(held[1].t)} held out"
     fact = Fact("photographs", text, {"count": len(T), "held_out": len(held[1].t)})
     depths = f"from {train.near:.3g} to {train.far:.3g}, equal steps in {train.spacing}"
     reach = Fact("scene depths", depths, {"near": train.near, "far": train.far})
-    parts = [Checked((fact, reach)), _camera(folder, train), check_poses(None, T), _look(T)]
+    parts = [Checked((fact, reach)), *_cameras(train)]
+    if np.isfinite(T).all():
+        parts += [check_poses(None, T), _look(T)]
     return join([*parts, Checked(notes=train.notes)])
 
 
-def _camera(folder: Path, photographs: Photographs) -> Checked:
-    """The camera of the images as they are on disk."""
-    from jaxpose.geometry.camera import resized
+def _model_alone(path: Path, error: Exception) -> Checked:
+    """A sparse model whose images cannot be used: its poses are a trajectory still."""
+    try:
+        model = read_colmap(colmap.find_model(path))
+    except (DataError, OSError) as unread:
+        return unusable(unread)
+    counts = {"images": len(model.names), "cameras": len(model.cameras), "points": len(model.points)}
+    fact = Fact("model", ", ".join(f"{count} {name}" for name, count in counts.items()), counts)
+    finding = Finding("warning", "images", str(error), "images to train on")
+    return join(
+        [Checked((fact,), (finding,)), check_poses(None, model.T_world_cam), _look(model.T_world_cam)]
+    )
 
-    name = photographs.files[0]
-    files = (folder / name, *(folder / f"{name}{suffix}" for suffix in SUFFIXES))
-    return check_camera(resized(photographs.camera, *image_size(next(f for f in files if f.is_file()))))
+
+def _cameras(photographs: Photographs) -> list[Checked]:
+    """The cameras of the images as they are on disk, as far as they are pinholes with OpenCV's distortion."""
+    cameras = {as_camera(lens) for lens in photographs.lenses}
+    return [check_camera(camera) for camera in list(cameras)[:1] if camera is not None]
 
 
 def _look(T: Float[np.ndarray, "n 4 4"]) -> Checked:

@@ -15,7 +15,8 @@ from jaxpose.datasets.events.sidecar import Source, load_source, with_camera
 from jaxpose.datasets.events.stream import BLOCK, Block, Stream, Unit
 from jaxpose.datasets.ground_truth import poses_at
 from jaxpose.datasets.images import image_size, only, some
-from jaxpose.datasets.photos.common import extent_depths, read_images
+from jaxpose.datasets.photos.common import extent_depths
+from jaxpose.datasets.photos.pixels import read_images
 from jaxpose.datasets.rgbd.tum import read_list
 from jaxpose.datasets.types import EventRecording, Photographs
 from jaxpose.errors import DataError

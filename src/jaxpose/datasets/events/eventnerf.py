@@ -12,7 +12,8 @@ from jaxpose.datasets.events.sidecar import Source, check_mosaic
 from jaxpose.datasets.events.stream import Unit
 from jaxpose.datasets.events.validate import check_span, clean
 from jaxpose.datasets.images import SUFFIXES, check_intrinsics, common_size, found, name_of
-from jaxpose.datasets.photos.common import check_poses, frame_numbers, read_images
+from jaxpose.datasets.photos.common import check_poses, frame_numbers
+from jaxpose.datasets.photos.pixels import read_images
 from jaxpose.datasets.types import EventRecording, Photographs
 from jaxpose.errors import DataError
 from jaxpose.events import Events, Mosaic

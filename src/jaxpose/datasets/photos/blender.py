@@ -1,38 +1,58 @@
 """Blender's `transforms_{train,test}.json`, and the `transforms.json` of nerfstudio and instant-ngp."""
 
-import json
 import math
+import os
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from jaxpose.datasets.images import SUFFIXES, image_size, natural_order
-from jaxpose.datasets.photos.common import OPENGL, check_poses, extent_depths, frame_numbers, read_images
+from jaxpose.datasets.images import natural_order
+from jaxpose.datasets.photos.common import (
+    OPENGL,
+    Depths,
+    check_poses,
+    focus_depths,
+    frame_numbers,
+    guessed_depths,
+    held_out_rows,
+)
+from jaxpose.datasets.photos.lens import Lens
+from jaxpose.datasets.photos.names import finder
+from jaxpose.datasets.photos.pixels import Mask, read_views, stored_size
+from jaxpose.datasets.photos.transforms_keys import (
+    SPLITS,
+    frame_lens,
+    number,
+    oblong,
+    parse,
+    stated_depths,
+    unused_keys,
+)
 from jaxpose.datasets.types import Photographs, take
 from jaxpose.errors import DataError
 from jaxpose.geometry import rigid
-from jaxpose.geometry.camera import Camera
 
-_LENS = ("k1", "k2", "p1", "p2", "k3")
-_INTRINSICS = ("camera_angle_x", "camera_angle_y", "fl_x", "fl_y", "cx", "cy", "w", "h", "k4", *_LENS)
-_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "PERSPECTIVE")
 _BLENDER = (2.0, 6.0)  # depths of the data set's objects, as BARF samples them
-_HELD_OUT = 8  # every 8th image of a file that holds all of them, the first included
 
 
 class _Source(NamedTuple):
-    """One file: the frames that have an image, in order of time, and what holds for all of them."""
+    """One file: the frames that have an image, in order of time."""
 
     file: Path
-    intrinsics: dict[str, Any]
     near_far: tuple[float, float] | None
+    states_focal: bool  # not an opening angle
+    states_size: bool
     names: list[str]
     images: list[Path]
+    lenses: list[Lens]
+    masks: list[Mask | None]
     T_world_cam: Float[np.ndarray, "n 4 4"]
     t: Float[np.ndarray, " n"]
     stamped: bool
+    split: tuple[Int[np.ndarray, " a"], Int[np.ndarray, " b"]] | None  # for training and held out, if stated
     notes: tuple[str, ...]
 
 
@@ -59,16 +79,33 @@ def transforms_file(path: Path | str) -> Path:
     )
 
 
+def detect(path: Path) -> bool:
+    """Whether a path is a json file, or a folder with one of training poses.
+
+    Args:
+        path: A folder or file.
+
+    Returns:
+        Whether `load` should read it.
+    """
+    names = ("transforms_train.json", "transforms.json")
+    return path.suffix == ".json" if path.is_file() else any((path / name).is_file() for name in names)
+
+
 def load(path: Path | str, *, width: int | None = None) -> tuple[Photographs, Photographs]:
     """Read photographs with poses: for training, and held out.
 
-    Held out is what `transforms_test.json` lists beside `transforms_train.json`, else every 8th image. A
-    frame is a file path, with or without suffix, and a camera-to-world pose in OpenGL axes; a frame without
-    its image is skipped and counted in a note. All frames share one camera: a focal length (`fl_x`) or an
-    opening angle (`camera_angle_x`), optionally centre, size and OpenCV's distortion. Timestamps are the
-    frames' `time` or `timestamp` [s] if each has its own, else frame numbers. The depth range is the file's
-    `near` and `far` if it states them, 2 to 6 for Blender's cameras at about 4 from the object, else a guess
-    from where the cameras look, as a note says.
+    Held out is what `transforms_test.json` (else `transforms_val.json`) lists beside
+    `transforms_train.json`, or what a `transforms.json` lists in `test_filenames` (else `val_filenames`),
+    else every 8th image. A frame is a file path, with or without suffix, and a camera-to-world pose in
+    OpenGL axes; a frame without its image is skipped and counted in a note. A camera, of all frames or of
+    each, is a focal length (`fl_x`) or an opening angle (`camera_angle_x`), optionally centre, size and
+    distortion (OpenCV's, its fisheye's, nerfstudio's); where cameras differ or have no `Camera`, images
+    are brought to one (`pixels.read_views`). Masks are those of `mask_path`, and instant-ngp's
+    `dynamic_mask_*.png` beside the images. Timestamps are the frames' `time` or `timestamp` [s] if each
+    has its own, else frame numbers. The depth range is the file's `near` and `far` if it states them, 2
+    to 6 for Blender's cameras at about 4 from the object, else a guess from where the cameras look, as a
+    note says.
 
     Args:
         path: The folder or its json file.
@@ -83,23 +120,31 @@ def load(path: Path | str, *, width: int | None = None) -> tuple[Photographs, Ph
     """
     file = transforms_file(path)
     source = _read(file)
-    full = _camera(source)
-    start = float(source.t[0]) if source.stamped else 0.0
-    train, transparent = _photographs(source, full, width, start)
-    near, far, spacing, note = _depths(source, transparent)
-    train = train._replace(near=near, far=far, spacing=spacing, notes=(*train.notes, *note))
-    test_file = file.with_name("transforms_test.json")
-    if file.name == "transforms_train.json" and test_file.is_file():
-        _enough(file, len(train.t), least=2)
-        other = _read(test_file)
-        if _camera(other) != full:
-            raise DataError(f"{test_file}: expected the camera of {file.name}, {full}, got {_camera(other)}")
-        test, _ = _photographs(other, full, width, start if other.stamped else 0.0)
-        return train, test._replace(near=near, far=far, spacing=spacing)
-    _enough(file, len(train.t), least=3)
-    held_out = np.arange(len(train.t)) % _HELD_OUT == 0
-    train = train._replace(notes=(*train.notes, f"held out: every {_HELD_OUT}th image, the first included"))
-    return take(train, np.flatnonzero(~held_out)), take(train, np.flatnonzero(held_out))
+    others = [file.with_name(f"transforms_{split}.json") for split in ("test", "val")]
+    other_file = next((other for other in others if other.is_file()), None)
+    if file.name == "transforms_train.json" and other_file is not None:
+        _enough(file, len(source.t), least=2)
+        other = _read(other_file)
+        parts, note = (source, other), ()
+        rows = (np.arange(len(source.t)), len(source.t) + np.arange(len(other.t)))
+    else:
+        _enough(file, len(source.t), least=3)
+        parts = (source,)
+        rows, note = _split(source)
+    photographs = _photographs(parts, width)
+    train, held_out = take(photographs, rows[0]), take(photographs, rows[1])
+    return (
+        train._replace(notes=(*source.notes, *photographs.notes, *note)),
+        held_out._replace(notes=(*parts[-1].notes, *photographs.notes)),
+    )
+
+
+def _split(source: _Source) -> tuple[tuple[Int[np.ndarray, " a"], Int[np.ndarray, " b"]], tuple[str, ...]]:
+    """Rows to train on and held out."""
+    if source.split is not None:
+        return source.split, ()
+    *rows, note = held_out_rows(len(source.t))
+    return (rows[0], rows[1]), (note,)
 
 
 def _enough(file: Path, count: int, least: int) -> None:
@@ -109,14 +154,15 @@ def _enough(file: Path, count: int, least: int) -> None:
 
 def _read(file: Path) -> _Source:
     """The content of one file, checked; DataError if it has no frame with an image."""
-    content = _parse(file)
+    content = parse(file)
     frames = content.get("frames")
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
         raise DataError(f"{file}: expected a list of frames, got {str(frames)[:60]}")
     if not all(isinstance(frame.get("file_path"), str) for frame in frames):
         raise DataError(f"{file}: expected a file_path in every frame, got one without")
     frames.sort(key=lambda frame: natural_order(frame["file_path"]))
-    found = [(frame, image) for frame in frames if (image := _find(file, frame["file_path"]))]
+    find = finder(file.parent)
+    found = [(frame, image) for frame in frames if (image := find(frame["file_path"]))]
     if not found:
         raise DataError(f"{file}: expected images beside it, got none of the {len(frames)} it lists")
     missing = len(frames) - len(found)
@@ -125,40 +171,80 @@ def _read(file: Path) -> _Source:
     order = np.argsort(t)
     frames, images = [frames[i] for i in order], [found[i][1] for i in order]
     skipped = (f"{file.name}: {missing} frames without an image skipped",) if missing else ()
+    common = {key: value for key, value in content.items() if key != "frames"}
+    entries = [{**common, **frame} for frame in frames]
+    lenses = _lenses(file, entries, images)
+    split, left = _stated_split(file, content, [frame["file_path"] for frame in frames])
     return _Source(
         file=file,
-        intrinsics=_intrinsics(file, content, frames),
-        near_far=_stated_depths(file, content),
+        near_far=stated_depths(file, content),
+        states_focal="fl_x" in entries[0],
+        states_size="w" in entries[0] or "h" in entries[0],
         names=[frame["file_path"] for frame in frames],
         images=images,
+        lenses=lenses,
+        masks=[_mask(file, frame, image) for frame, image in zip(frames, images, strict=True)],
         T_world_cam=_poses(file, frames),
         t=t[order],
         stamped=stamped,
-        notes=(*skipped, *note),
+        split=split,
+        notes=(*skipped, *note, *left, *unused_keys(file, content, frames), *oblong(file, lenses[0])),
     )
 
 
-def _parse(file: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(file.read_text(encoding="utf-8-sig", errors="replace"))
-    except json.JSONDecodeError as error:
-        raise DataError(f"{file}:{error.lineno}: expected JSON, got {error.msg}") from None
-    if not isinstance(content, dict):
-        raise DataError(f"{file}: expected a JSON object, got {str(content)[:60]}")
-    return content
+def _lenses(file: Path, entries: Sequence[dict[str, Any]], images: Sequence[Path]) -> list[Lens]:
+    """The lens of each image. A size that is not stated is that of the first image."""
+    size = stored_size(images[0])[0]
+    return [frame_lens(file, entry, size) for entry in entries]
 
 
-def _find(file: Path, name: str) -> Path | None:
-    """The image of a frame, whose suffix Blender's files leave out."""
-    path = file.parent / name
-    return next((p for p in (path, *(Path(f"{path}{s}") for s in SUFFIXES)) if p.is_file()), None)
+def _mask(file: Path, frame: dict[str, Any], image: Path) -> Mask | None:
+    """nerfstudio's mask, bright where pixels count, or instant-ngp's, bright where they do not."""
+    if frame.get("mask_path") is not None:
+        found = finder(file.parent)(str(frame["mask_path"]))
+        if found is None:
+            raise DataError(f"{file}: expected the mask of {frame['file_path']}, got no {frame['mask_path']}")
+        return Mask(found)
+    beside = image.with_name(f"dynamic_mask_{image.stem}.png")
+    return Mask(beside, hides=True) if beside.is_file() else None
+
+
+def _stated_split(
+    file: Path, content: dict[str, Any], names: Sequence[str]
+) -> tuple[tuple[Int[np.ndarray, " a"], Int[np.ndarray, " b"]] | None, tuple[str, ...]]:
+    """Rows to train on and held out where a file lists them, and notes on what that leaves out."""
+    listed = {key: set(map(_plain, content[key])) for key in SPLITS if isinstance(content.get(key), list)}
+    if not listed:
+        return None, ()
+    train, val, test = (listed.get(key, set()) for key in SPLITS)
+    held = test or val
+    rows = {_plain(name): row for row, name in enumerate(names)}
+    held_rows = sorted(rows[name] for name in held if name in rows)
+    chosen = train if train else rows.keys() - held - val
+    train_rows = sorted(rows[name] for name in chosen if name in rows and name not in held)
+    if not train_rows or not held_rows:
+        raise DataError(
+            f"{file}: expected {SPLITS[0]} and {SPLITS[2]} (or {SPLITS[1]}) to name frames with images, got "
+            f"{len(train_rows)} and {len(held_rows)} of them"
+        )
+    notes = [f"held out: the {len(held_rows)} images of {SPLITS[2] if test else SPLITS[1]}"]
+    if left := len(names) - len(train_rows) - len(held_rows):
+        notes.append(f"{left} images left out, which are in neither of the lists used")
+    if unknown := len((held | chosen) - rows.keys()):
+        notes.append(f"{unknown} names of the lists are those of no frame with an image")
+    return (np.array(train_rows), np.array(held_rows)), tuple(notes)
+
+
+def _plain(name: Any) -> str:
+    """The name of an image without what writers do differently."""
+    return os.path.normpath(str(name).replace("\\", "/"))
 
 
 def _times(file: Path, frames: list[dict[str, Any]]) -> tuple[Float[np.ndarray, " n"], bool, tuple[str, ...]]:
     """Time of each frame, whether these are timestamps, and what to tell about them."""
     for key in ("time", "timestamp"):
         if any(key in frame for frame in frames):
-            timestamps = [_number(file, frame, key) if key in frame else math.nan for frame in frames]
+            timestamps = [number(file, frame, key) if key in frame else math.nan for frame in frames]
             if len(set(timestamps)) == len(timestamps) and np.isfinite(timestamps).all():
                 return np.array(timestamps), True, ()
             t, note = frame_numbers([frame["file_path"] for frame in frames])
@@ -170,7 +256,7 @@ def _times(file: Path, frames: list[dict[str, Any]]) -> tuple[Float[np.ndarray, 
 def _poses(file: Path, frames: list[dict[str, Any]]) -> Float[np.ndarray, "n 4 4"]:
     """Camera-to-world in OpenCV axes; the world's stay as they are."""
     rows = np.empty((len(frames), 3, 4))
-    for number, frame in enumerate(frames):
+    for index, frame in enumerate(frames):
         try:
             matrix = np.array(frame.get("transform_matrix"), np.float64)
         except (TypeError, ValueError):
@@ -180,131 +266,46 @@ def _poses(file: Path, frames: list[dict[str, Any]]) -> Float[np.ndarray, "n 4 4
                 f"{file}: {frame['file_path']}: expected a transform_matrix of 4 rows of 4 numbers, "
                 f"got {str(frame.get('transform_matrix'))[:60]}"
             )
-        rows[number] = matrix[:3]
+        rows[index] = matrix[:3]
     T_world_cam = rigid.make(rows[..., :3], rows[..., 3])
     return check_poses(T_world_cam, lambda i: f"{file}: {frames[i]['file_path']}") @ OPENGL
 
 
-def _intrinsics(file: Path, content: dict[str, Any], frames: list[dict[str, Any]]) -> dict[str, float]:
-    """What the file says of the camera, for all frames at once or in each of them."""
-    model = content.get("camera_model", _MODELS[0])
-    if model not in _MODELS or content.get("is_fisheye"):
-        raise DataError(f"{file}: expected a camera_model of {', '.join(_MODELS)}, got {model} or a fisheye")
-    common = {key: _number(file, content, key) for key in _INTRINSICS if key in content}
-    each = [
-        {**common, **{key: _number(file, frame, key) for key in _INTRINSICS if key in frame}}
-        for frame in frames
-    ]
-    for frame, intrinsics in zip(frames, each, strict=True):
-        if intrinsics != each[0]:
-            raise DataError(
-                f"{file}: {frame['file_path']}: expected the camera of {frames[0]['file_path']}, {each[0]}, "
-                f"got {intrinsics}"
-            )
-    if each[0].get("k4"):
-        raise DataError(f"{file}: expected a lens of {' '.join(_LENS)}, got k4 {each[0]['k4']}")
-    return each[0]
-
-
-def _camera(source: _Source) -> Camera:
-    """The camera of the images as they are on disk; DataError without a focal length."""
-    file, given = source.file, source.intrinsics
-    width, height = image_size(source.images[0])
-    width, height = int(given.get("w", width)), int(given.get("h", height))
-    if "fl_x" in given:
-        fx = given["fl_x"]
-    elif "camera_angle_x" in given:
-        fx = _focal(width, given["camera_angle_x"])
-    else:
-        raise DataError(f"{file}: expected a focal length, fl_x or camera_angle_x, got neither")
-    if "fl_y" in given:
-        fy = given["fl_y"]
-    elif "camera_angle_y" in given and "fl_x" not in given:
-        fy = _focal(height, given["camera_angle_y"])
-    else:
-        fy = fx
-    if not (0 < fx < 1e3 * width and 0 < fy < 1e3 * width):
-        raise DataError(f"{file}: expected a focal length above 0 px, got {fx:g} and {fy:g}")
-    lens = tuple(given.get(key, 0.0) for key in _LENS)
-    return Camera(
-        fx=fx,
-        fy=fy,
-        cx=given.get("cx", 0.5 * width) - 0.5,  # these files count from the outer corner of the first pixel
-        cy=given.get("cy", 0.5 * height) - 0.5,
+def _photographs(parts: Sequence[_Source], width: int | None) -> Photographs:
+    """The images of one file or of two, through one camera; the notes are those on pixels and depths."""
+    first = parts[0]
+    stated = f"as {first.file.name} states" if first.states_size else "the size of the first"
+    pixels = read_views(
+        [image for part in parts for image in part.images],
+        [seen for part in parts for seen in part.lenses],
+        [mask for part in parts for mask in part.masks],
+        stated=stated,
         width=width,
-        height=height,
-        distortion=lens if any(lens) else (),
+    )
+    start = float(first.t[0])
+    near, far, spacing, note = _depths(first, pixels.transparent)
+    return Photographs(
+        name=first.file.resolve().parent.name,
+        camera=pixels.camera,
+        t=np.concatenate([part.t - (start if part.stamped else 0.0) for part in parts]),
+        rgb=pixels.rgb,
+        T_world_cam=np.concatenate([part.T_world_cam for part in parts]),
+        near=near,
+        far=far,
+        spacing=spacing,
+        files=tuple(name for part in parts for name in part.names),
+        notes=(*pixels.notes, *note),
+        mask=pixels.mask,
+        lenses=tuple(seen for part in parts for seen in part.lenses),
     )
 
 
-def _focal(size: int, angle: float) -> float:
-    """The focal length [px] that sees `size` pixels within an angle [rad]; 0 for what is no such angle."""
-    return 0.5 * size / math.tan(0.5 * angle) if 0 < angle < math.pi else 0.0
-
-
-def _number(file: Path, entries: dict[str, Any], key: str) -> float:
-    value = entries[key]
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise DataError(f"{file}: expected a number for {key}, got {str(value)[:60]}")
-    return float(value)
-
-
-def _photographs(source: _Source, full: Camera, width: int | None, start: float) -> tuple[Photographs, bool]:
-    """All but the depth range, which is Blender's here, and whether any image is transparent."""
-    given = source.intrinsics
-    stated = f"as {source.file.name} states" if "w" in given or "h" in given else "the size of the first"
-    rgb, transparent, camera = read_images(source.images, full, stated=stated, width=width)
-    photographs = Photographs(
-        name=source.file.resolve().parent.name,
-        camera=camera,
-        t=source.t - start,
-        rgb=rgb,
-        T_world_cam=source.T_world_cam,
-        near=_BLENDER[0],
-        far=_BLENDER[1],
-        spacing="depth",
-        files=tuple(source.names),
-        notes=source.notes,
-    )
-    return photographs, transparent
-
-
-def _stated_depths(file: Path, content: dict[str, Any]) -> tuple[float, float] | None:
-    if "near" not in content or "far" not in content:
-        return None
-    near, far = _number(file, content, "near"), _number(file, content, "far")
-    if not 0 < near < far:
-        raise DataError(f"{file}: expected near above 0 and far beyond it, got {near:g} and {far:g}")
-    return near, far
-
-
-def _depths(
-    source: _Source, transparent: bool
-) -> tuple[float, float, Literal["depth", "disparity"], tuple[str, ...]]:
+def _depths(source: _Source, transparent: bool) -> Depths:
     """Near, far and the spacing between them, and a note where they are a guess."""
     if source.near_far:
         return *source.near_far, "depth", ()
-    depth = _focus_depths(source.T_world_cam)
-    if depth is None:
-        (near, far), spacing, why = extent_depths(source.T_world_cam), "disparity", "the cameras' extent"
-    elif "fl_x" not in source.intrinsics and _BLENDER[0] < depth.min() and depth.max() < _BLENDER[1]:
-        return *_BLENDER, "depth", ()
-    elif transparent:
-        near, far, spacing = 0.5 * float(depth.min()), 1.5 * float(depth.max()), "depth"
-        why = "the distance to the point that the cameras look at, an object on nothing"
-    else:
-        near, far, spacing = 0.25 * float(depth.min()), 8 * float(depth.max()), "disparity"
-        why = "the distance to the point that the cameras look at"
-    return near, far, spacing, (f"near {near:.3g} and far {far:.3g} are guessed from {why}",)
-
-
-def _focus_depths(T_world_cam: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, " n"] | None:
-    """Depth, in each view, of the point nearest to all optical axes; None unless all look at one."""
-    axes, centres = T_world_cam[:, :3, 2], T_world_cam[:, :3, 3]
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    total = across.mean(0)
-    if np.linalg.eigvalsh(total)[0] < 1e-3:  # all but parallel
-        return None
-    focus = np.linalg.solve(total, np.einsum("nij,nj->i", across, centres) / len(centres))
-    depth = np.einsum("ni,ni->n", focus - centres, axes)
-    return depth if (depth > 0).all() else None
+    depth = focus_depths(source.T_world_cam)
+    if depth is not None and not source.states_focal:
+        if _BLENDER[0] < depth.min() and depth.max() < _BLENDER[1]:
+            return *_BLENDER, "depth", ()
+    return guessed_depths(source.T_world_cam, transparent)

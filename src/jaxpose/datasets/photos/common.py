@@ -1,47 +1,20 @@
-"""What loaders of posed photographs share: image files of one size, frame numbers, poses checked."""
+"""What loaders of photographs share: frame numbers, poses checked, a guess of the depths."""
 
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, UInt8
-from PIL import Image
+from jaxtyping import Float, Int
 
-from jaxpose.datasets.images import image_size, open_image
 from jaxpose.errors import DataError
 from jaxpose.files.trajectories import orthonormal
-from jaxpose.geometry import camera
-from jaxpose.geometry.camera import Camera
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # right, up, back to right, down, forward, and the other way
+_HELD_OUT = 8
 
-
-def read_images(
-    files: Sequence[Path], full: Camera, *, stated: str, width: int | None
-) -> tuple[UInt8[np.ndarray, "n h w 3"], bool, Camera]:
-    """Images on white, resized by area to `width`, whether any was transparent, and the resized camera.
-
-    Every image must be of the size of `full`; `stated` says in the error where that size comes from. Images
-    are not enlarged: DataError for a `width` beyond theirs, ValueError for one below 1.
-    """
-    if width is not None and width < 1:
-        raise ValueError(f"width: expected at least 1 pixel, got {width}")
-    if width is not None and width > full.width:
-        raise DataError(f"{files[0]}: expected an image at least {width} wide, got {full.width}")
-    for file in files:
-        size = image_size(file)
-        if size != (full.width, full.height):
-            raise DataError(f"{file}: expected {full.width}x{full.height}, {stated}, got {size[0]}x{size[1]}")
-    small = full if width is None else camera.scale(full, width / full.width)
-    rgb = np.empty((len(files), small.height, small.width, 3), np.uint8)
-    transparent = False
-    for number, file in enumerate(files):
-        opaque, alpha = open_image(file, _on_white)
-        transparent |= alpha
-        # The box filter is the mean over each new pixel's area.
-        rgb[number] = opaque.resize((small.width, small.height), Image.Resampling.BOX)
-    return rgb, transparent, small
+Depths = tuple[float, float, Literal["depth", "disparity"], tuple[str, ...]]  # near, far, spacing, notes
 
 
 def frame_numbers(names: Sequence[str]) -> tuple[Float[np.ndarray, " n"], str]:
@@ -76,13 +49,34 @@ def extent_depths(T_world_cam: Float[np.ndarray, "n 4 4"]) -> tuple[float, float
     return 0.1 * extent, 100 * extent
 
 
-def _on_white(image: Image.Image) -> tuple[Image.Image, bool]:
-    """The image in 8-bit RGB, what shows through it white, and whether anything does."""
-    if image.mode.startswith(("I", "F")):  # Pillow would clip these
-        raise ValueError(f"pixels of kind {image.mode}, not of 8 bits")
-    if not image.has_transparency_data:
-        return image.convert("RGB"), False
-    image = image.convert("RGBA")
-    white = Image.new("RGBA", image.size, "white")
-    transparent = bool(np.asarray(image.getchannel("A")).min() < 255)
-    return Image.alpha_composite(white, image).convert("RGB"), transparent
+def focus_depths(T_world_cam: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, " n"] | None:
+    """Depth, in each view, of the point nearest to all optical axes; None unless all look at one."""
+    axes, centres = T_world_cam[:, :3, 2], T_world_cam[:, :3, 3]
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    total = across.mean(0)
+    if np.linalg.eigvalsh(total)[0] < 1e-3:  # all but parallel
+        return None
+    focus = np.linalg.solve(total, np.einsum("nij,nj->i", across, centres) / len(centres))
+    depth = np.einsum("ni,ni->n", focus - centres, axes)
+    return depth if (depth > 0).all() else None
+
+
+def guessed_depths(T_world_cam: Float[np.ndarray, "n 4 4"], transparent: bool) -> Depths:
+    """Near and far by where the cameras look, or how far they move; with a note."""
+    depth = focus_depths(T_world_cam)
+    if depth is None:
+        (near, far), spacing, why = extent_depths(T_world_cam), "disparity", "the cameras' extent"
+    elif transparent:
+        near, far, spacing = 0.5 * float(depth.min()), 1.5 * float(depth.max()), "depth"
+        why = "the distance to the point that the cameras look at, an object on nothing"
+    else:
+        near, far, spacing = 0.25 * float(depth.min()), 8 * float(depth.max()), "disparity"
+        why = "the distance to the point that the cameras look at"
+    return near, far, spacing, (f"near {near:.3g} and far {far:.3g} are guessed from {why}",)
+
+
+def held_out_rows(count: int) -> tuple[Int[np.ndarray, " a"], Int[np.ndarray, " b"], str]:
+    """Rows to train on and held out where no file says, every 8th from the first, and a note."""
+    held_out = np.arange(count) % _HELD_OUT == 0
+    note = f"held out: every {_HELD_OUT}th image, the first included"
+    return np.flatnonzero(~held_out), np.flatnonzero(held_out), note

@@ -6,7 +6,9 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxpose.datasets.images import SUFFIXES, image_size
-from jaxpose.datasets.photos.common import OPENGL, check_poses, frame_numbers, read_images
+from jaxpose.datasets.photos.common import OPENGL, check_poses, frame_numbers
+from jaxpose.datasets.photos.lens import from_camera
+from jaxpose.datasets.photos.pixels import read_images
 from jaxpose.datasets.types import Photographs, take
 from jaxpose.errors import DataError
 from jaxpose.files.untrusted import read_npy
@@ -15,6 +17,18 @@ from jaxpose.geometry.camera import Camera
 
 _NEAREST = 0.75  # share of the least depth bound that becomes 1
 _FARTHEST = 1e8  # [scene units] where BARF's disparity of 1e-8 is
+
+
+def detect(path: Path) -> bool:
+    """Whether a folder has the file of poses and bounds.
+
+    Args:
+        path: A folder.
+
+    Returns:
+        Whether `load` should read it.
+    """
+    return (path / "poses_bounds.npy").is_file()
 
 
 def load(path: Path | str, *, width: int | None = None) -> tuple[Photographs, Photographs]:
@@ -61,6 +75,7 @@ def load(path: Path | str, *, width: int | None = None) -> tuple[Photographs, Ph
             note,
             f"depths that the file states, in the scaled scene: {bounds[0]:.3g} to {bounds[1]:.3g}",
         ),
+        lenses=(from_camera(full),) * len(rows),
     )
     first_held = len(rows) - max(1, len(rows) // 10)
     return take(photographs, np.arange(first_held)), take(photographs, np.arange(first_held, len(rows)))
@@ -90,7 +105,9 @@ def _images(file: Path, count: int, width: int | None) -> list[Path]:
     """The images of the folder that fits best, one for each row of the file."""
     folders: list[tuple[int, list[Path]]] = []
     for folder in sorted(file.parent.glob("images*")):
-        images = sorted(p for p in folder.glob("*") if p.suffix.lower() in SUFFIXES)
+        images = sorted(
+            p for p in folder.glob("*") if p.suffix.lower() in SUFFIXES and not p.name.startswith(".")
+        )
         if images:
             folders.append((image_size(images[0])[0], images))
     if not folders:

@@ -8,8 +8,9 @@ import numpy as np
 import optax
 from jaxtyping import Float, PRNGKeyArray
 
+from jaxpose.datasets.types import Photographs
 from jaxpose.evaluation import trajectory_error
-from jaxpose.experiments.image_metrics import image_metrics, means, pose_numbers
+from jaxpose.experiments.image_metrics import POSE_NUMBERS, image_metrics, means, pose_numbers
 from jaxpose.experiments.noisy_nerf.model import Model
 from jaxpose.experiments.noisy_nerf.options import Config, Problem
 from jaxpose.experiments.progress import OnUpdate, Update
@@ -33,14 +34,23 @@ PROTOCOL = {
 }
 
 
+# Where no pose is known there is nothing to align with, and no view can be placed but by training on it.
+UNPOSED_PROTOCOL = {
+    **dict.fromkeys(PROTOCOL, "not measured: no poses are known"),
+    "image_metrics": "psnr, ssim, lpips: mean over some of the views trained on, from the poses found",
+}
+_TRAINING_VIEWS = 4
+
+
 class Measured(NamedTuple):
-    """The numbers, the held-out views to draw, and poses aligned with the ground truth."""
+    """The numbers, views to draw, and poses aligned with the ground truth, where there is any."""
 
     numbers: dict[str, Any]
     views: list[HeldOut]
     T_start: Float[np.ndarray, "n 4 4"]
     T_estimate: Float[np.ndarray, "n 4 4"]
     alignment: Similarity  # of the latter
+    posed: bool  # whether there is ground truth
 
 
 def measure(
@@ -51,11 +61,7 @@ def measure(
     T_world_cam: Float[np.ndarray, "n 4 4"],
     on_update: OnUpdate,
 ) -> Measured:
-    """Errors of the trained poses, and of what the scene shows from held-out ones."""
-    ground_truth = problem.train.T_world_cam
-    errors = trajectory_error.pose_errors(T_world_cam, ground_truth)
-    at_start = trajectory_error.pose_errors(problem.T_start, ground_truth)
-    to_estimate = trajectory_error.procrustes(ground_truth, T_world_cam)
+    """Errors of the trained poses, and of what the scene shows from held-out ones, else from trained ones."""
     viewer = photometric.viewer(
         model.scene,
         problem.train.camera,
@@ -65,12 +71,18 @@ def measure(
         refine_optimizer=optax.adam(model.refine_rate),
     )
     scene = set_progress(state.scene, jnp.ones(()))
+    if not np.isfinite(problem.train.T_world_cam).all():
+        return _measure_training_views(problem, viewer, scene, T_world_cam, on_update)
+    ground_truth = problem.train.T_world_cam
+    errors = trajectory_error.pose_errors(T_world_cam, ground_truth)
+    at_start = trajectory_error.pose_errors(problem.T_start, ground_truth)
+    to_estimate = trajectory_error.procrustes(ground_truth, T_world_cam)
     keys = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), 1), len(problem.held_out.t))
     as_aligned, as_refined, views = [], [], []
     on_update(Update("rendering held-out views", 0, len(keys), "views"))
     for index, key in enumerate(keys):
         pose = trajectory_error.align(to_estimate, problem.held_out.T_world_cam[index : index + 1])[0]
-        image, view = _seen(viewer, scene, problem, index, pose)
+        image, view = _seen(viewer, scene, problem.held_out, index, pose)
         as_aligned.append(image)
         views.append(view)
         if config.test_pose_steps:
@@ -93,7 +105,32 @@ def measure(
         trajectory_error.align(at_start.alignment, problem.T_start),
         trajectory_error.align(errors.alignment, T_world_cam),
         errors.alignment,
+        True,
     )
+
+
+def _measure_training_views(
+    problem: Problem,
+    viewer: Viewer,
+    scene: Any,
+    T_world_cam: Float[np.ndarray, "n 4 4"],
+    on_update: OnUpdate,
+) -> Measured:
+    """What the scene shows of photographs without known poses, from the poses found for them."""
+    rows = np.unique(np.linspace(0, len(T_world_cam) - 1, _TRAINING_VIEWS).round().astype(int))
+    on_update(Update("rendering training views"))
+    seen = [_seen(viewer, scene, problem.train, int(row), T_world_cam[row]) for row in rows]
+    unknown = dict.fromkeys(POSE_NUMBERS)
+    numbers = {
+        **unknown,
+        **means([image for image, _ in seen]),
+        "test_time_refined": None,
+        "start": unknown,
+        "max": {"rotation_error_deg": None, "translation_error": None},
+        "held_out": [],
+    }
+    still = Similarity(1.0, np.eye(3), np.zeros(3))
+    return Measured(numbers, [view for _, view in seen], problem.T_start, T_world_cam, still, False)
 
 
 def _test_time_refined(
@@ -104,19 +141,22 @@ def _test_time_refined(
     pose: Float[np.ndarray, "4 4"],
     key: PRNGKeyArray,
 ) -> dict[str, float | None]:
-    rgb = jnp.asarray(problem.held_out.rgb[index])
-    moved = viewer.refine_pose(scene, jnp.asarray(pose, jnp.float32), rgb, key)
-    return _seen(viewer, scene, problem, index, np.asarray(moved, np.float64))[0]
+    held_out = problem.held_out
+    rgb = jnp.asarray(held_out.rgb[index])
+    mask = None if held_out.mask is None else jnp.asarray(held_out.mask[index])
+    moved = viewer.refine_pose(scene, jnp.asarray(pose, jnp.float32), rgb, key, mask)
+    return _seen(viewer, scene, held_out, index, np.asarray(moved, np.float64))[0]
 
 
 def _seen(
-    viewer: Viewer, scene: Any, problem: Problem, index: int, pose: Float[np.ndarray, "4 4"]
+    viewer: Viewer, scene: Any, photographs: Photographs, index: int, pose: Float[np.ndarray, "4 4"]
 ) -> tuple[dict[str, float | None], HeldOut]:
-    """A held-out photograph rendered from a pose: how alike they are, and both."""
+    """A photograph's view rendered from a pose: how alike they are where pixels count, and both."""
     rgb, depth = viewer.image(scene, jnp.asarray(pose, jnp.float32))
     rendered = np.clip(np.asarray(rgb, np.float64), 0, 1)
-    photograph = problem.held_out.rgb[index]
-    label = problem.held_out.files[index]
-    return image_metrics(rendered, photograph / 255), HeldOut(
+    photograph = photographs.rgb[index]
+    mask = None if photographs.mask is None else photographs.mask[index]
+    label = photographs.files[index]
+    return image_metrics(rendered, photograph / 255, mask), HeldOut(
         label, photograph, rendered, np.asarray(depth, np.float64)
     )

@@ -79,7 +79,11 @@ def build(config: Config, problem: Problem) -> Model:
         {"scene": scene_rate, **rates},
         train,
         depths,
-        Views(t, jnp.asarray(photographs.rgb)),
+        Views(
+            t,
+            jnp.asarray(photographs.rgb),
+            None if photographs.mask is None else jnp.asarray(photographs.mask),
+        ),
         trainer(scene, field, photographs.camera, depths, optimizer, train),
         _BARF_REFINE[barf],
     )

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.distance import pdist
 
-from jaxpose.datasets.photos import blender, llff
+from jaxpose.datasets.photos.registry import load_photographs
 from jaxpose.datasets.synthetic import pose_noise
 from jaxpose.datasets.synthetic.orbit import DIAMETER, orbit
 from jaxpose.datasets.types import Photographs, every, take
@@ -28,7 +28,7 @@ _SMOKE_WIDTH, _SMOKE_VIEWS = 24, 8
 
 # The options of the first screen of help.
 GROUPS = {
-    "data": ("data", "image_width"),
+    "data": ("data", "focal_px", "image_width"),
     "poses": ("noise", "noise_translation", "pose"),
     "training": ("preset", "steps", "seed", "study"),
     "run": ("out", "name", "resume", "smoke", "json"),
@@ -39,7 +39,8 @@ GROUPS = {
 class Config:
     """Settings of a run; photographs and these are all that a result depends on."""
 
-    # A folder in the layout of Blender, nerfstudio, instant-ngp or LLFF; "orbit": an object made on the fly.
+    # A folder in the layout of Blender, nerfstudio, instant-ngp, LLFF or COLMAP, or of images alone (with
+    # --noise unknown); "orbit": an object made on the fly.
     data: Path = ORBIT
     # The pose field. spline_reset: a pose per image, reset to a smoothing spline every 100 steps.
     pose: Pose = "posenet"
@@ -53,6 +54,7 @@ class Config:
     # has the world's, where turning goes about the world's origin; on the camera's it turns out of view.
     side: Literal["world", "camera"] = "world"
     every: int = 1  # use every n-th training image
+    focal_px: float | None = None  # [px] of images alone, as they are on disk; None: what their EXIF says
     image_width: int | None = None  # [px] images are reduced to; None: 100, with preset paper 400
     orbit_views: int = 100  # photographs of the object that is made on the fly
     seed: int = 0  # of the noise, the network's start, the rays
@@ -78,7 +80,7 @@ class Config:
             noise_translation=0, noise_rotation_deg=0, noise_sigma=0, seed=0, test_pose_steps=0,
             every=1, orbit_views=4, image_width=8, steps=CHUNK, rays=1, spline_knots=2,
         )  # fmt: skip
-        check_positive(self, "spline_smoothing")
+        check_positive(self, "spline_smoothing", "focal_px")
         if self.noise_rotation_deg > 180:
             raise ValueError(f"--noise-rotation-deg: expected at most 180, got {self.noise_rotation_deg:g}")
         if self.steps is not None and self.steps % CHUNK:
@@ -92,7 +94,9 @@ class Config:
             check_unused(self, ("noise_translation", "noise_rotation_deg"), f"with --noise {self.noise}")
         if self.noise != "independent":
             check_unused(self, ("noise_sigma",), f"with --noise {self.noise}")
-        if self.data != ORBIT:
+        if self.data == ORBIT:
+            check_unused(self, ("focal_px",), "without --data")
+        else:
             check_unused(self, ("orbit_views",), "with --data")
         if self.study is None and self.pose != "posenet":
             check_unused(
@@ -119,7 +123,7 @@ class Problem(NamedTuple):
     train: Photographs
     held_out: Photographs
     T_start: Float[np.ndarray, "n 4 4"]  # camera-to-world
-    extent: float  # largest distance between true cameras [scene units]
+    extent: float  # largest distance between true cameras [scene units]; NaN where none is known
     metadata: dict[str, Any]  # the data and the noise in words and numbers
 
 
@@ -132,6 +136,10 @@ def load(config: Config) -> Problem:
     train = every(train, config.every)
     if len(train.t) < 4:
         raise DataError(f"{config.data}: expected at least 4 images to train on, got {len(train.t)}")
+    if config.noise != "unknown" and not np.isfinite(train.T_world_cam).all():
+        raise DataError(
+            f"{config.data}: expected poses for --noise {config.noise}, got none: --noise unknown"
+        )
     extent = DIAMETER if config.data == ORBIT else float(pdist(train.T_world_cam[:, :3, 3]).max())
     T_start, words = _disturbed(config, train, extent)
     metadata = {
@@ -152,19 +160,11 @@ def _photographs(config: Config) -> tuple[Photographs, Photographs]:
         return orbit(_SMOKE_VIEWS if config.smoke else config.orbit_views, width)
     if not config.data.exists():
         raise DataError(f"{config.data}: expected a folder of photographs, or orbit, got nothing")
-    if (config.data / "poses_bounds.npy").is_file():
-        train, held_out = llff.load(config.data, width=width)
-    elif config.data.is_dir() and not any(config.data.glob("transforms*.json")):
-        raise DataError(
-            f"{config.data}: expected transforms_train.json or transforms.json (Blender, nerfstudio, "
-            "instant-ngp) or poses_bounds.npy (LLFF), got none of them"
-        )
-    else:
-        train, held_out = blender.load(config.data, width=width)
+    train, held_out = load_photographs(config.data, width=width, focal_px=config.focal_px)
     if config.smoke:
         train, held_out = (
             take(train, np.arange(min(_SMOKE_VIEWS, len(train.t)))),
-            take(held_out, np.arange(1)),
+            take(held_out, np.arange(min(1, len(held_out.t)))),
         )
     return train, held_out
 

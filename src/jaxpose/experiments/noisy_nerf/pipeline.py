@@ -19,11 +19,12 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxpose.datasets.photos import blender
+from jaxpose.datasets.photos.registry import find_format, images_folder
 from jaxpose.datasets.photos.transforms_json import write_transforms
 from jaxpose.experiments import devices, training_loop
 from jaxpose.experiments.command import MODULE, Command, execute
 from jaxpose.experiments.devices import Job
-from jaxpose.experiments.noisy_nerf.evaluation import PROTOCOL, Measured, measure
+from jaxpose.experiments.noisy_nerf.evaluation import PROTOCOL, UNPOSED_PROTOCOL, Measured, measure
 from jaxpose.experiments.noisy_nerf.model import Model, build, describe, splined
 from jaxpose.experiments.noisy_nerf.options import (
     GROUPS,
@@ -161,7 +162,7 @@ def _single(
         started,
         data=problem.metadata,
         training=describe(config, model),
-        protocol=PROTOCOL,
+        protocol=PROTOCOL if measured.posed else UNPOSED_PROTOCOL,
         **measured.numbers,
     )
     atomic.write_json(finished, results)  # last: with it the run counts as finished
@@ -171,17 +172,27 @@ def _single(
 def _draw(folder: Path, config: Config, problem: Problem, measured: Measured, trained: Trained) -> None:
     numbers, title = measured.numbers, _title(problem)
     found = (
-        f"{config.pose}: rotation {numbers['start']['rotation_error_deg']:.2f} to "
-        f"{numbers['rotation_error_deg']:.3f} deg, translation "
-        f"{numbers['start']['translation_error_percent']:.2f} to "
-        f"{numbers['translation_error_percent']:.3f}% of the cameras' extent"
+        f"{config.pose}: no poses are known to compare with"
+        if not measured.posed
+        else (
+            f"{config.pose}: rotation {numbers['start']['rotation_error_deg']:.2f} to "
+            f"{numbers['rotation_error_deg']:.3f} deg, translation "
+            f"{numbers['start']['translation_error_percent']:.2f} to "
+            f"{numbers['translation_error_percent']:.3f}% of the cameras' extent"
+        )
     )
-    ground_truth = problem.train.T_world_cam
+    ground_truth = problem.train.T_world_cam if measured.posed else None
     nerf_plots.cameras(
         folder / "cameras.png", ground_truth, measured.T_start, measured.T_estimate, f"{title}\n{found}"
     )
-    psnr = f"{config.pose}, held-out PSNR {numbers['psnr']:.2f} dB"
-    nerf_plots.held_out(folder / "held_out.png", measured.views, f"{title}\n{psnr}")
+    kind = "held-out" if measured.posed else "training"
+    psnr = f"{config.pose}, {kind} PSNR {numbers['psnr']:.2f} dB"
+    nerf_plots.held_out(
+        folder / f"{kind.replace('-', '_')}.png",
+        measured.views,
+        f"{title}\n{psnr}",
+        photograph=f"{kind} photograph",
+    )
     nerf_plots.curves(folder / "curves.png", {config.pose: _history(trained.history)}, f"{title}\n{found}")
 
 
@@ -192,13 +203,14 @@ def _write_poses(folder: Path, config: Config, problem: Problem, measured: Measu
     trajectories.write_tum(
         folder / "trajectory.txt", trajectories.Trajectory(photographs.t, measured.T_estimate)
     )
-    trajectories.write_tum(
-        folder / "reference.txt", trajectories.Trajectory(photographs.t, photographs.T_world_cam)
-    )
+    if measured.posed:
+        trajectories.write_tum(
+            folder / "reference.txt", trajectories.Trajectory(photographs.t, photographs.T_world_cam)
+        )
     with atomic.atomic(folder / "start.npz") as temporary:
         np.savez(temporary, t=photographs.t, T_world_cam=problem.T_start)
-    images_folder = "." if config.data == ORBIT else _images_folder(config.data).resolve()
-    write_camera(folder / "camera.json", photographs.camera, photographs.files, images_folder)
+    images = "." if config.data == ORBIT else images_folder(config.data).resolve()
+    write_camera(folder / "camera.json", photographs.camera, photographs.files, images)
     if config.data == ORBIT:  # its images are on no disk yet
         for part in (photographs, problem.held_out):
             for name, rgb in zip(part.files, part.rgb, strict=True):
@@ -206,17 +218,10 @@ def _write_poses(folder: Path, config: Config, problem: Problem, measured: Measu
                 imageio.imwrite(folder / name, rgb)
         write_transforms(folder / "transforms_test.json", problem.held_out)
         write_transforms(folder / "transforms_train.json", refined)
-    elif (config.data / "poses_bounds.npy").is_file():
-        write_transforms(folder / "transforms.json", refined)
-    else:
+    elif find_format(config.data) == "transforms":
         write_transforms(folder / "transforms.json", refined, source=blender.transforms_file(config.data))
-
-
-def _images_folder(data: Path) -> Path:
-    """The folder that the names of the images are relative to."""
-    if (data / "poses_bounds.npy").is_file():
-        return data
-    return blender.transforms_file(data).parent
+    else:
+        write_transforms(folder / "transforms.json", refined)
 
 
 def _title(problem: Problem) -> str:

@@ -16,7 +16,7 @@ def describe_step(extent: float, loss: float, rotation_deg: float, translation: 
     """Where a training is, in words.
 
     Args:
-        extent: largest distance between true cameras [scene units].
+        extent: largest distance between true cameras [scene units]; NaN where none is known.
         loss: mean squared colour error.
         rotation_deg: mean rotation error [deg].
         translation: mean translation error [scene units].
@@ -24,8 +24,10 @@ def describe_step(extent: float, loss: float, rotation_deg: float, translation: 
     Returns:
         The words by their names.
     """
-    off = f"{rotation_deg:.2f} deg {100 * translation / extent:.2f}%"
-    return {"loss": f"{loss:.5f}", "PSNR": f"{-10 * math.log10(loss):.2f} dB", "off": off}
+    words = {"loss": f"{loss:.5f}", "PSNR": f"{-10 * math.log10(loss):.2f} dB"}
+    if math.isfinite(extent):
+        words["off"] = f"{rotation_deg:.2f} deg {100 * translation / extent:.2f}%"
+    return words
 
 
 def table(runs: dict[str, dict[str, Any]]) -> str:
@@ -33,10 +35,10 @@ def table(runs: dict[str, dict[str, Any]]) -> str:
     rows = [_COLUMNS] + [
         (
             label,
-            f"{run['rotation_error_deg']:.3f}",
-            f"{run['translation_error']:.4f}",
-            f"{run['translation_error_percent']:.3f}",
-            f"{run['centre_error_percent']:.3f}",
+            number(run["rotation_error_deg"], 3),
+            number(run["translation_error"], 4),
+            number(run["translation_error_percent"], 3),
+            number(run["centre_error_percent"], 3),
             number(run["psnr"], 2),
             number(run["ssim"], 3),
             number(run["lpips"], 3),
@@ -57,20 +59,26 @@ def report(folder: Path, results: dict[str, Any]) -> str:
     width, height = data["size"]
     smoke = SMOKE if results["smoke"] else ""
     refined = {label: run["test_time_refined"] for label, run in runs.items() if run["test_time_refined"]}
+    at_start, share = [], ""
+    if start["rotation_error_deg"] is not None:
+        at_start = [
+            f"               {start['rotation_error_deg']:.2f} deg, "
+            f"{start['translation_error_percent']:.2f}% (centres {start['centre_error_percent']:.2f}%) "
+            "at the start"
+        ]
+        share = f"; in percent of the cameras' extent, {data['extent']:.3g}"
     lines = [
         f"noisy_nerf: {data['data']}, {data['images']} views of {width}x{height}, "
         f"preset {training['preset']}, {training['steps']} steps of {training['rays']} rays x "
         f"{training['samples']} samples, seed {results['seed']}{smoke}",
         *(f"  note         {note}" for note in data["notes"]),
-        f"  noise        {data['noise']}:",
-        f"               {start['rotation_error_deg']:.2f} deg, {start['translation_error_percent']:.2f}% "
-        f"(centres {start['centre_error_percent']:.2f}%) at the start",
+        f"  noise        {data['noise']}{':' if at_start else ''}",
+        *at_start,
         "",
         table(runs),
         "",
         f"  RE           {protocol['rotation_error_deg']}",
-        f"  TE           {protocol['translation_error']}; in percent of the cameras' extent, "
-        f"{data['extent']:.3g}",
+        f"  TE           {protocol['translation_error']}{share}",
         f"  alignment    {protocol['alignment']}",
         f"  PSNR ...     {protocol['image_metrics']}",
         *(

@@ -1,0 +1,85 @@
+"""Any folder of photographs: which of the layouts it has, by its files, and its loader."""
+
+from pathlib import Path
+from typing import Literal, get_args
+
+from jaxpose.datasets.images import found
+from jaxpose.datasets.photos import blender, colmap, llff, plain
+from jaxpose.datasets.types import Photographs
+from jaxpose.errors import DataError
+
+Format = Literal["llff", "transforms", "colmap", "plain"]
+
+# In the order in which they are tried: what states poses goes before a model that it was made from.
+_LAYOUTS = {
+    "llff": (llff, "poses_bounds.npy (LLFF)"),
+    "transforms": (blender, "transforms_train.json or transforms.json (Blender, nerfstudio, instant-ngp)"),
+    "colmap": (colmap, "a sparse model (COLMAP)"),
+    "plain": (plain, "images alone"),
+}
+
+
+def find_format(path: Path | str) -> Format:
+    """The layout of a folder by its files, or of a json file.
+
+    Args:
+        path: The folder or file.
+
+    Returns:
+        The name of the layout.
+
+    Raises:
+        DataError: Saying what was expected and what is there.
+    """
+    path = Path(path)
+    for name in get_args(Format):
+        if _LAYOUTS[name][0].detect(path):
+            return name
+    expected = ", ".join(words for _, words in _LAYOUTS.values())
+    raise DataError(f"{path}: expected photographs, with {expected}, got {found(path)}")
+
+
+def load_photographs(
+    path: Path | str,
+    format: Format | None = None,
+    *,
+    width: int | None = None,
+    focal_px: float | None = None,
+) -> tuple[Photographs, Photographs]:
+    """Read photographs in any of the layouts.
+
+    Args:
+        path: The folder, or a json file.
+        format: The layout; by default the one that `find_format` finds.
+        width: Images are resized by area to it [px]; by default they are not.
+        focal_px: Focal length of the images as they are on disk [px], where no file states a camera.
+
+    Returns:
+        Photographs to train on, and those held out. Poses are NaN where none are known, in layout "plain".
+
+    Raises:
+        DataError: Naming the file for anything that cannot be used, and for a focal length beside a camera.
+        ValueError: For a width below 1.
+    """
+    format = format or find_format(path)
+    if format == "plain":
+        return plain.load(path, width=width, focal_px=focal_px)
+    if focal_px is not None:
+        raise DataError(f"{path}: expected no focal length with {_LAYOUTS[format][1]}, which states cameras")
+    return _LAYOUTS[format][0].load(path, width=width)
+
+
+def images_folder(path: Path | str, format: Format | None = None) -> Path:
+    """The folder that the names of photographs' files are relative to.
+
+    Args:
+        path: As `load_photographs` takes it.
+        format: The layout; by default the one that `find_format` finds.
+
+    Returns:
+        The folder.
+    """
+    format = format or find_format(path)
+    if format == "transforms":
+        return blender.transforms_file(path).parent
+    return colmap.images_folder(path) if format == "colmap" else Path(path)
