@@ -88,14 +88,13 @@ def trainer(
         # Once for every image, not for every ray.
         T_world_cam = jax.vmap(field.pose, (None, 0))(pose_params, views.t)[view]
         rays = jax.vmap(partial(pixel_ray, camera))(T_world_cam, pixel.astype(T_world_cam.dtype))
-        weight = _weights(views.mask, (view, pixel[:, 1], pixel[:, 0]), T_world_cam.dtype)
         batch = (
             rays,
             draw_depths(depth_key, depths, rays=config.rays, samples=config.samples),
             _unit(views.rgb[view, pixel[:, 1], pixel[:, 0]]),
-            weight,
+            _weights(views.mask, (view, pixel[:, 1], pixel[:, 0]), T_world_cam.dtype),
         )
-        return total(scene_params, batch) / (3 * jnp.maximum(jnp.sum(weight), 1))
+        return _mean(total(scene_params, batch), batch[-1])
 
     return joint(loss, scene.init, field.init, optimizer, config.steps)
 
@@ -182,14 +181,13 @@ def viewer(
             pixel_key, depth_key = jax.random.split(jax.random.fold_in(key, step))
             pixel = _pixels(pixel_key, config.rays, *rgb.shape[:2])
             moved = se3.compose(se3.exp(twist), T_world_cam)
-            weight = _weights(mask, (pixel[:, 1], pixel[:, 0]), moved.dtype)
             batch = (
                 jax.vmap(partial(pixel_ray, camera, moved))(pixel.astype(moved.dtype)),
                 draw_depths(depth_key, depths, rays=config.rays, samples=config.samples),
                 _unit(rgb[pixel[:, 1], pixel[:, 0]]),
-                weight,
+                _weights(mask, (pixel[:, 1], pixel[:, 0]), moved.dtype),
             )
-            return total((), batch) / (3 * jnp.maximum(jnp.sum(weight), 1))
+            return _mean(total((), batch), batch[-1])
 
         still = jnp.zeros(6, T_world_cam.dtype)
         twist = optim.minimize(loss, still, refine_optimizer, refine_steps).params
@@ -241,6 +239,11 @@ def _pixels(key: PRNGKeyArray, count: int, height: int, width: int) -> Int[Array
 def _weights(mask: Any, at: tuple[Any, ...], dtype: Any) -> Float[Array, " rays"]:
     """1 for pixels that count, 0 for others."""
     return jnp.ones(at[0].shape, dtype) if mask is None else mask[at].astype(dtype)
+
+
+def _mean(total: Float[Array, ""], weights: Float[Array, " rays"]) -> Float[Array, ""]:
+    """The error of a colour channel of the pixels that count, from its sum over all."""
+    return total / (3 * jnp.maximum(jnp.sum(weights), 1))
 
 
 def draw_depths(

@@ -138,9 +138,10 @@ def _formats() -> Formats:
 
 
 def _is_recording(path: Path) -> bool:
+    from jaxpose.datasets.events.single_file import is_events
     from jaxpose.datasets.rgbd import registry as rgbd_registry
 
-    return rgbd_registry.detect(path) is not None
+    return is_events(path) or rgbd_registry.detect(path) is not None
 
 
 def _folder(path: Path, topics: Sequence[str]) -> tuple[str, Checked]:

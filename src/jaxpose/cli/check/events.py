@@ -17,7 +17,7 @@ from jaxpose.files.tables import read_unchecked
 
 _MOST = 500_000  # events that are looked at: recordings have hundreds of millions
 _RATES_HZ = (1e2, 1e9)
-_NAMES = {"eventnerf": "EventNeRF", "davis": "DAVIS", "hdf5": "HDF5", "npz": "npz"}
+_NAMES = {"eventnerf": "EventNeRF", "davis": "DAVIS", "hdf5": "HDF5", "npz": "npz", "file": "file of"}
 
 
 def find_events(path: Path) -> event_registry.Format | None:

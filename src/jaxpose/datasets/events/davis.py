@@ -3,16 +3,14 @@
 Lines of `t x y p`, frames, calibration and ground truth.
 """
 
-import warnings
-from collections.abc import Iterator
 from pathlib import Path
-from typing import NoReturn
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxpose.datasets.events.sidecar import Source, load_source, with_camera
-from jaxpose.datasets.events.stream import BLOCK, Block, Stream, Unit
+from jaxpose.datasets.events.stream import Unit
+from jaxpose.datasets.events.text import text_stream
 from jaxpose.datasets.ground_truth import poses_at
 from jaxpose.datasets.images import image_size, only, some
 from jaxpose.datasets.photos.common import extent_depths
@@ -22,9 +20,6 @@ from jaxpose.datasets.types import EventRecording, Photographs
 from jaxpose.errors import DataError
 from jaxpose.events import Mosaic
 from jaxpose.files.trajectories import Trajectory
-
-_COLUMNS = "4 numbers (t x y p)"
-_EXACT_DIGITS = 15  # of a whole number in float64
 
 
 def detect(path: Path) -> bool:
@@ -96,7 +91,7 @@ def find(path: Path | str, *, size: tuple[int, int] | None = None) -> Source:
     """
     path = Path(path)
     file = path if path.is_file() else _only_file(path)
-    stream = Stream(file, lambda: _blocks(file), lambda row: f"{file}:{_line_of(file, row)}", "s")
+    stream = text_stream(file, "s")
     listing = file.parent / "images.txt"
     if not listing.is_file():
         return with_camera(stream, size)
@@ -111,59 +106,6 @@ def _only_file(folder: Path) -> Path:
     if folder / "events.txt" in files:
         return folder / "events.txt"
     return only(files, folder, "events.txt, or one events*.txt")
-
-
-def _blocks(file: Path) -> Iterator[Block]:
-    with file.open(encoding="utf-8-sig", errors="replace") as lines:
-        kind = _kind(file)
-        while True:
-            try:
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore", UserWarning)  # nothing left to read
-                    table = np.loadtxt(lines, kind, max_rows=BLOCK, ndmin=1)
-            except ValueError as error:
-                _name_line(file, error)
-            yield Block(table["t"], table["x"], table["y"], table["p"])
-            if len(table) < BLOCK:
-                return
-
-
-def _kind(file: Path) -> np.dtype:
-    """Float64 for all but timestamps of so many digits that only integers hold them, as ns since 1970 are."""
-    with file.open(encoding="utf-8-sig", errors="replace") as lines:
-        first = next((fields for fields in map(_fields, lines) if fields), ["0"])[0]
-    whole = first.isdecimal() and len(first) > _EXACT_DIGITS
-    return np.dtype([("t", np.int64 if whole else np.float64), *((name, np.float64) for name in "xyp")])
-
-
-def _fields(line: str) -> list[str]:
-    return line.split("#")[0].split()
-
-
-def _line_of(file: Path, row: int) -> int:
-    """The number of the line that has event `row`."""
-    with file.open(encoding="utf-8-sig", errors="replace") as lines:
-        for number, line in enumerate(lines, start=1):
-            if _fields(line):
-                if row == 0:
-                    return number
-                row -= 1
-    raise IndexError(f"{file}: no event {row} more")
-
-
-def _name_line(file: Path, error: ValueError) -> NoReturn:
-    """DataError with the first line that is none of an event's."""
-    with file.open(encoding="utf-8-sig", errors="replace") as lines:
-        for number, line in enumerate(lines, start=1):
-            fields = _fields(line)
-            if fields and len(fields) != 4:
-                raise DataError(f"{file}:{number}: expected {_COLUMNS}, got {len(fields)}")
-            try:
-                [float(field) for field in fields]
-            except ValueError:
-                got = repr(line.strip()[:60])
-                raise DataError(f"{file}:{number}: expected {_COLUMNS}, got {got}") from None
-    raise DataError(f"{file}: expected lines of {_COLUMNS}, got {error}")
 
 
 def _frames(

@@ -66,13 +66,18 @@ def check_mosaic(mosaic: str) -> None:
 def with_camera(stream: Stream, size: tuple[int, int] | None) -> Source:
     """A stream and the camera of `camera.json` or `calib.txt` in its folder.
 
-    `camera.json` is a run's (`files.camera_json`). `calib.txt` is the event camera data set's, `fx fy cx cy
-    k1 k2 p1 p2 k3`, with OpenCV's distortion. It does not have the size: that is `size` (width, height), else
-    the smallest of the known sensors that holds 99% of the first events and has cx, cy within 15% of its
-    middle. Without both files the focal length is taken to be as long as the sensor is wide.
+    `camera.json` is a run's (`files.camera_json`). `calib.txt` is the event camera data set's, `fx fy cx
+    cy k1 k2 p1 p2 k3`, with OpenCV's distortion. It does not have the size: that is what the file of
+    events states, else `size` (width, height), else the smallest of the known sensors that holds 99% of
+    the first events and has cx, cy within 15% of its middle. Without both files the focal length is taken
+    to be as long as the sensor is wide.
 
-    DataError for files that cannot be used, and for a `size` that is not that of `camera.json`.
+    DataError for files that cannot be used, and for a `size` other than that of `camera.json` or the file's.
     """
+    if size and stream.size and size != stream.size:
+        got = f"{stream.size[0]}x{stream.size[1]}"
+        raise DataError(f"{stream.file}: expected a sensor of {size[0]}x{size[1]}, got {got}")
+    size = size or stream.size
     file, calibration = stream.file.parent / "camera.json", stream.file.parent / "calib.txt"
     if file.is_file():
         camera = read_camera(file).camera

@@ -33,6 +33,9 @@ class Stream(NamedTuple):
     blocks: Callable[[], Iterator[Block]]
     where: Callable[[int], str]  # the place of an event in the file, for messages
     unit: Unit | None = None  # that the format states
+    size: tuple[int, int] | None = None  # width and height of the sensor, where the file states it
+    notes: Callable[[], tuple[str, ...]] = tuple  # what was left out, once the blocks are read
+    unit_is_sure: bool = False  # whether no rate of events speaks against the unit
 
 
 class StreamStats(NamedTuple):
@@ -65,7 +68,7 @@ def stream_stats(
         block = block._replace(t=block.t.astype(np.float64 if block.t.dtype.kind == "f" else np.int64))
         if stats is None:
             first = zero if zero is not None else block.t[0].item()
-            stats = StreamStats(unit or _possible(block.t, stream.unit) or find_unit(block.t), first)
+            stats = StreamStats(unit or _possible(block.t, stream) or find_unit(block.t), first)
         # Integers as integers: float64 has not the digits for nanoseconds since 1970.
         t = (block.t - block.t.dtype.type(stats.zero)).astype(np.float64) / _PER_SECOND[stats.unit]
         block = block._replace(t=t)
@@ -172,9 +175,9 @@ def check_numbers(stream: Stream, block: Block, seen: int) -> None:
                 raise DataError(f"{stream.where(seen + row)}: expected {wanted}, got {values[row]:g}")
 
 
-def _possible(t: np.ndarray, stated: Unit | None) -> Unit | None:
+def _possible(t: np.ndarray, stream: Stream) -> Unit | None:
     """The stated unit if the events then come at a rate that a sensor has, or if they are too few to tell."""
-    span = float(t.max()) - float(t.min())
-    if stated is None or not span or len(t) < _FEWEST:
+    span, stated = float(t.max()) - float(t.min()), stream.unit
+    if stated is None or stream.unit_is_sure or not span or len(t) < _FEWEST:
         return stated
     return stated if _RATES_HZ[0] <= len(t) / span * _PER_SECOND[stated] <= _RATES_HZ[1] else None

@@ -114,7 +114,7 @@ def _refuse(stream: Stream, size: tuple[int, int], stats: StreamStats | None) ->
 
 def _notes(stream: Stream, size: tuple[int, int], unit: Unit | None, stats: StreamStats) -> tuple[str, ...]:
     """What was guessed, left out and sorted."""
-    notes = []
+    notes = list(stream.notes())
     if unit is None and stats.unit != stream.unit:
         span = stats.latest - stats.earliest
         note = f"timestamps read as {_WORDS[stats.unit]}"
