@@ -72,7 +72,7 @@ def test_a_good_imu_has_no_fault(tmp_path):
 @pytest.mark.parametrize(
     ("fault", "test", "words"),
     [
-        ({"gyro": 180 / np.pi}, "gyroscope unit", "degrees/s"),
+        ({"gyro": 180 / np.pi}, "gyroscope unit", "in deg/s"),
         ({"force": 1 / 9.80665}, "accelerometer unit", "in g; multiply by 9.80665"),
         ({"force": -1.0}, "gravity", "change the sign"),
         ({"late_s": 0.05}, "clock offset", "50.0 ms late"),
@@ -80,13 +80,18 @@ def test_a_good_imu_has_no_fault(tmp_path):
         ({"change": inverted}, "IMU and poses", "invert the poses"),
         ({"roll": -1}, "quaternion order", "quaternions in the order xyzw"),
         ({"change": lambda T: FLIP @ T}, "gravity", "down"),
-        ({"ns": 10**6}, "unit of time", "from us to ns"),
     ],
 )
 def test_faults_of_an_imu_are_named(tmp_path, fault, test, words):
     result = checked(euroc(tmp_path, **fault))
     assert test in named_tests(result) and words in faults(result), faults(result)
     assert exit_code(result) == 2
+
+
+def test_microseconds_are_read_and_said(tmp_path):
+    result = checked(euroc(tmp_path, ns=10**6))
+    assert faults(result) == ""
+    assert sum("timestamps are in us, by their size and steps" in note for note in result.notes) == 2
 
 
 def test_a_turned_imu_is_named_with_its_rotation(tmp_path):

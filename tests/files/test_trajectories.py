@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+from decimal import Decimal
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 import jaxpose
 from jaxpose.errors import DataError
-from jaxpose.files import atomic, run_folder, trajectories
+from jaxpose.files import association, atomic, run_folder, trajectories
 
 
 def random_trajectory(seed, count=20):
@@ -38,7 +39,8 @@ def test_tum_round_trip(tmp_path_factory, seed):
     written = random_trajectory(seed)
     trajectories.write_tum(file, written)
     read = trajectories.read_tum(file)
-    np.testing.assert_array_equal(read.t, written.t)
+    assert read.t0_ns == Decimal(repr(float(written.t[0]))) * 10**9 and read.t[0] == 0
+    np.testing.assert_array_equal(trajectories.since(read, 0), written.t)
     np.testing.assert_array_equal(read.T[:, :3, 3], written.T[:, :3, 3])
     np.testing.assert_allclose(read.T, written.T, atol=1e-14)
 
@@ -52,11 +54,12 @@ def test_kitti_round_trip(tmp_path):
 
 
 def test_tum_conventions(tmp_path):
-    """Quaternions are xyzw of any length, comments skipped, poses map to the world."""
+    """Quaternions are xyzw, comments skipped, poses map to the world."""
     file = tmp_path / "trajectory.txt"
     half = np.sqrt(0.5)
-    file.write_text(f"# t tx ...\n\n1.5 1 2 3 0 0 {half} {half}\r\n  2.5\t4 5 6 0 0 0 -2\n")
-    t, T = trajectories.read_tum(file)
+    file.write_text(f"# t tx ...\n\n1.5 1 2 3 0 0 {half} {half}\r\n  2.5\t4 5 6 0 0 0 -1\n")
+    t, T, t0_ns = trajectories.read_tum(file)
+    assert t0_ns == 0
     np.testing.assert_array_equal(t, [1.5, 2.5])
     np.testing.assert_allclose(T[0] @ [1, 0, 0, 1], [1, 3, 3, 1], atol=1e-15)
     np.testing.assert_allclose(T[1] @ [1, 0, 0, 1], [5, 5, 6, 1], atol=1e-15)
@@ -68,8 +71,8 @@ def test_euroc_conventions(tmp_path):
     half = np.sqrt(0.5)
     for rest in ("", ",0" * 9):
         file.write_text(f"#timestamp, ...\n1403715524907143168,1,2,3,{half},0,0,{half}{rest}\n")
-        t, T = trajectories.read_euroc(file)
-        assert t[0] == pytest.approx(1403715524.907143168, abs=3e-7)
+        t, T, t0_ns = trajectories.read_euroc(file)
+        assert t[0] == 0 and t0_ns == 1403715524907143168
         np.testing.assert_allclose(T[0] @ [1, 0, 0, 1], [1, 3, 3, 1], atol=1e-15)
 
 
@@ -91,7 +94,7 @@ def test_readers_agree_with_evo(data_dir, name):
         ours, theirs = trajectories.read_euroc(file), file_interface.read_euroc_csv_trajectory(file)
     else:
         ours, theirs = trajectories.read_tum(file), file_interface.read_tum_trajectory_file(file)
-    np.testing.assert_allclose(ours.t, theirs.timestamps, rtol=0, atol=3e-7)
+    np.testing.assert_allclose(trajectories.since(ours, 0), theirs.timestamps, rtol=0, atol=3e-7)
     np.testing.assert_allclose(ours.T, np.array(theirs.poses_se3), atol=1e-9)
 
 
@@ -118,31 +121,33 @@ KITTI_LINE = "1 0 0 0 0 1 0 0 0 0 1 0\n"
         (
             trajectories.read_tum,
             TUM_LINE + "2 0 0 0 0 0 0 0\n",
-            "trajectory:2: expected a unit quaternion, got zero",
+            "trajectory:2: expected finite numbers, got NaN, infinity or a zero quaternion",
         ),
+        (trajectories.read_tum, "2 0 0 0 0 0 0 0\n", "trajectory:1: expected a unit quaternion, got zero"),
         (
             trajectories.read_tum,
-            TUM_LINE + "2 0 0 0 0 nan 0 1\n",
-            "trajectory:2: expected finite numbers, got '2 0 0 0 0 nan",
+            TUM_LINE + "2 0 0 0 0 0 0 2\n",
+            "trajectory:2: expected a unit quaternion xyzw behind the position, got one of length 2",
         ),
+        (trajectories.read_tum, TUM_LINE + "2 0 0 0 0 nan 0 1\n", "trajectory:2: expected finite numbers"),
         (trajectories.read_tum, TUM_LINE + "2 0 inf 0 0 0 0 1\n", "trajectory:2: expected finite numbers"),
         (
             trajectories.read_tum,
             TUM_LINE + TUM_LINE,
-            "trajectory:2: expected a timestamp after 1.0 s, got 1.0 s",
+            "trajectory:2: expected a timestamp after that before, got a repeated one",
         ),
         (
             trajectories.read_tum,
             TUM_LINE + "0.5" + TUM_LINE[1:],
             "trajectory:2: expected a timestamp after 1.0 s, got 0.5 s",
         ),
-        (trajectories.read_tum, "\x00\x89PNG\n", "trajectory:1: expected 8 numbers"),
+        (trajectories.read_tum, "\x00\x89PNG\n", "trajectory: expected lines of 8 numbers .*, got none"),
         (trajectories.read_euroc, EUROC_LINE + "1 2 3\n", "trajectory:2: expected 17 numbers .*, got 1"),
         (trajectories.read_euroc, EUROC_LINE[:-1] + ",0\n", "trajectory:1: expected 17 numbers .*, got 9"),
         (
             trajectories.read_euroc,
-            EUROC_LINE + "2000000000,0,0,0,0,0,0,0\n",
-            "trajectory:2: expected a unit quaternion",
+            EUROC_LINE + "2000000000,0,0,0,1,1,0,0\n",
+            "trajectory:2: expected a unit quaternion wxyz",
         ),
         (trajectories.read_kitti, KITTI_LINE + TUM_LINE, "trajectory:2: expected 12 numbers .*, got 8"),
         (
@@ -172,7 +177,7 @@ def test_missing_truth_is_left_out_of_tum_and_refused_by_kitti(tmp_path):
     trajectory.T[3] = np.nan
     trajectories.write_tum(tmp_path / "reference.txt", trajectory)
     np.testing.assert_array_equal(
-        trajectories.read_tum(tmp_path / "reference.txt").t, np.delete(trajectory.t, 3)
+        trajectories.since(trajectories.read_tum(tmp_path / "reference.txt"), 0), np.delete(trajectory.t, 3)
     )
     with pytest.raises(DataError, match="poses.txt: expected finite poses, got NaN or infinity in frame 3"):
         trajectories.write_kitti(tmp_path / "poses.txt", trajectory.T)
@@ -193,7 +198,7 @@ def test_associate_agrees_with_evo(t_a, t_b, most):
     short, long = (t_b, t_a) if len(t_b) <= len(t_a) else (t_a, t_b)
     expected_short, expected_long = sync.matching_time_indices(short, long, most)
     try:
-        found_a, found_b = trajectories.associate(t_a, t_b, most)
+        found_a, found_b = association.associate(t_a, t_b, most)
     except DataError:
         found_a = found_b = np.array([], int)
     found_short, found_long = (found_b, found_a) if len(t_b) <= len(t_a) else (found_a, found_b)
@@ -204,20 +209,25 @@ def test_associate_agrees_with_evo(t_a, t_b, most):
 @settings(deadline=None)
 @given(STAMPS, STAMPS)
 def test_associate_finds_the_nearest(t_a, t_b):
-    found_a, found_b = trajectories.associate(t_a, t_b, np.inf)
+    found_a, found_b = association.associate(t_a, t_b, np.inf)
     distance = np.abs(t_a[:, None] - t_b)
     nearest = distance.min(axis=0) if len(t_b) <= len(t_a) else distance.min(axis=1)
     np.testing.assert_array_equal(distance[found_a, found_b], nearest)
 
 
 @pytest.mark.parametrize(
-    "t_b, found", [(np.array([9.0, 10.0]), "9.000 to 10.000 s"), (np.array([]), "no timestamps")]
+    "t_b, found",
+    [
+        (np.array([9.0, 10.0]), "9.000 to 10.000 s, the nearest two 7 s apart"),
+        (np.array([0.9, 1.025]), "0.900 to 1.025 s, the nearest two 0.025 s apart"),
+        (np.array([]), "no timestamps"),
+    ],
 )
 def test_disjoint_stamps_are_refused(t_b, found):
     with pytest.raises(
         DataError, match=f"expected timestamps within 0.01 s, got 0.000 to 2.000 s and {found}"
     ):
-        trajectories.associate(np.array([0.0, 1.0, 2.0]), t_b)
+        association.associate(np.array([0.0, 1.0, 2.0]), t_b)
 
 
 # --- writing --------------------------------------------------------------------------------------------

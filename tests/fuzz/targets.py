@@ -407,5 +407,5 @@ TARGETS = {
     "timestamps": Target(_tum_file, _of("a.txt", trajectories.read_timestamps)),
     "camchain": Target(_camchain, _of("a.yaml", read_mounting)),
     "mounting": Target(lambda folder: _sheet(folder / "a.yaml", True), _of("a.yaml", read_mounting)),
-    "imu": Target(_imu, _of("a.csv", lambda file: read_imu(file, 0))),
+    "imu": Target(_imu, _of("a.csv", lambda file: read_imu(file).since(0))),
 }

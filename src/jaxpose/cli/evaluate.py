@@ -1,8 +1,9 @@
 """How far an estimated trajectory is from a reference: ATE, RPE and rotation error, with their protocol.
 
-ESTIMATE and REFERENCE are trajectory files (TUM, KITTI, EuRoC or TUM-VI csv, lists of 4x4 matrices: found by
-their content) or run folders of this package. Poses are paired by nearest timestamp, or row by row where a
-format has no timestamps; a run's continuous trajectory is evaluated at the reference's own timestamps.
+ESTIMATE and REFERENCE are trajectory files (TUM, KITTI, EuRoC, TUM-VI or VINS csv, tables with a header,
+lists of 4x4 matrices: found by their content) or run folders of this package. Poses are paired by nearest
+timestamp, or row by row where a format has no timestamps; a run's continuous trajectory is evaluated at the
+reference's own timestamps.
 """
 
 from collections.abc import Sequence
@@ -18,12 +19,14 @@ from jaxpose.cli.source import FIELD, Source, read_field, read_source
 from jaxpose.errors import DataError
 from jaxpose.evaluation import trajectory_error
 from jaxpose.evaluation.consistency import Consistency, aligned_error, consistency, relative_error
+from jaxpose.evaluation.observability import free_rotation
 from jaxpose.evaluation.trajectory_error import Alignment, Statistics
 from jaxpose.experiments.checks import check_finite, check_least, check_positive
 from jaxpose.experiments.command import Command, execute
 from jaxpose.experiments.outcome import markdown_table
 from jaxpose.experiments.progress import OnUpdate, Update, silent
 from jaxpose.files import trajectories
+from jaxpose.files.association import associate, nearest
 from jaxpose.geometry import rigid
 from jaxpose.geometry.rigid import Similarity
 
@@ -57,6 +60,8 @@ class Config:
     rpe_metres: tuple[float, ...] = ()  # relative errors over so much of the reference's path [m]
     consistency: bool = False  # whether errors are as large as the covariances of a run's field.npz say
     plot: Path | None = None  # PNG to draw both trajectories and the errors in
+    columns: str | None = None  # of ESTIMATE, where it does not say: `t[us] tx ty tz qw qx qy qz`
+    reference_columns: str | None = None  # of REFERENCE, likewise
     json: bool = False  # print the numbers as JSON and nothing else
 
     def __post_init__(self):
@@ -87,7 +92,7 @@ class Result(NamedTuple):
     alignment: Alignment
     transform: Similarity  # estimate -> reference
     ate_m: Statistics
-    rotation_deg: Statistics
+    rotation_deg: Statistics  # NaN where the alignment leaves a rotation free
     rpe: tuple[Relative, ...]
     consistency: dict[str, Consistency] | None  # of poses, and of moves of one second
     notes: tuple[str, ...]
@@ -97,7 +102,7 @@ class Result(NamedTuple):
 class _Pairs(NamedTuple):
     """Poses row by row, at the reference's timestamps."""
 
-    t: Float[np.ndarray, " n"]
+    t: Float[np.ndarray, " n"]  # [s] since the reference's origin; of an exact match, on the run's clock
     estimate: Float[np.ndarray, "n 4 4"]
     reference: Float[np.ndarray, "n 4 4"]
     how: str
@@ -119,12 +124,16 @@ def run(config: Config, on_update: OnUpdate = silent) -> Result:
         DataError, OSError: for what cannot be used.
     """
     on_update(Update(f"reading {config.estimate} and {config.reference}", quiet=True))
-    estimate, reference = read_source(config.estimate), read_source(config.reference)
+    estimate = read_source(config.estimate, config.columns)
+    reference = read_source(config.reference, config.reference_columns)
     pairs = _pair(config, estimate, reference)
     ate = trajectory_error.ate(pairs.estimate, pairs.reference, config.align)
     aligned = trajectory_error.align(ate.alignment, pairs.estimate)
     turned = np.degrees(rigid.rotation_angle(aligned[:, :3, :3], pairs.reference[:, :3, :3]))
     rpe, notes = _relative(config, pairs)
+    rotation = trajectory_error.statistics(turned)
+    if config.align != "none" and (free := _free(pairs, aligned)):
+        rotation, notes = trajectory_error.statistics(np.full(1, np.nan)), (*notes, free)
     consistent = _consistency(config, pairs, ate.alignment) if config.consistency else None
     if config.plot is not None:
         on_update(Update("drawing figures", quiet=True))
@@ -148,7 +157,7 @@ def run(config: Config, on_update: OnUpdate = silent) -> Result:
         alignment=config.align,
         transform=ate.alignment,
         ate_m=trajectory_error.statistics(ate.errors),
-        rotation_deg=trajectory_error.statistics(turned),
+        rotation_deg=rotation,
         rpe=rpe,
         consistency=consistent,
         notes=notes,
@@ -208,27 +217,64 @@ def _pair(config: Config, estimate: Source, reference: Source) -> _Pairs:
     match = config.match
     if match == "auto":
         match = "exact" if (config.estimate / FIELD).is_file() and reference.stamped else "nearest"
-    (t_estimate, T_estimate), (t_reference, T_reference) = estimate.trajectory, reference.trajectory
     if match == "exact":
         return _exact(config, estimate, reference)
     if not (estimate.stamped and reference.stamped):
-        if len(t_estimate) != len(t_reference):
-            raise DataError(
-                f"{estimate.path}: expected {len(t_reference)} poses, as {reference.path} has, to pair them "
-                f"row by row (one of the two has no timestamps), got {len(t_estimate)}"
-            )
-        t = t_reference if reference.stamped else t_estimate + config.time_offset_s
-        stamped = reference.stamped or estimate.stamped
-        return _Pairs(t, T_estimate, T_reference, "row by row, as not both have timestamps", stamped)
+        return _row_by_row(config, estimate, reference)
+    t_reference, T_reference, t0_ns = reference.trajectory
+    t_estimate = trajectories.since(estimate.trajectory, t0_ns - round(config.time_offset_s * 1e9))
+    T_estimate = estimate.trajectory.T
+    apart = np.abs(t_estimate - t_reference[nearest(t_estimate, t_reference)]).min()
+    if apart > config.max_difference_s:
+        raise DataError(
+            f"{estimate.path}: expected timestamps within {config.max_difference_s:g} s of those of "
+            f"{reference.path}, {reference.span()}, got {estimate.span()}: nearest timestamps {apart:.3g} s "
+            "apart; --max-difference-s, --time-offset-s"
+        )
     # Reference first: of two equally long ones each pose of the estimate takes its nearest, as evo does.
-    of_reference, of_estimate = trajectories.associate(
-        t_reference, t_estimate + config.time_offset_s, config.max_difference_s
-    )
+    of_reference, of_estimate = associate(t_reference, t_estimate, config.max_difference_s)
     fewer = min(len(t_reference), len(t_estimate))
     most = f"at most {config.max_difference_s:g} s apart"
     how = f"of {fewer} poses of the shorter one: nearest timestamps, {most}"
     how += f"; the estimate's moved by {config.time_offset_s:g} s" if config.time_offset_s else ""
     return _Pairs(t_reference[of_reference], T_estimate[of_estimate], T_reference[of_reference], how, True)
+
+
+def _row_by_row(config: Config, estimate: Source, reference: Source) -> _Pairs:
+    """Poses of equal numbers, where one of the two has no timestamps; a line left out has no partner."""
+    if estimate.lines != reference.lines:
+        raise DataError(
+            f"{estimate.path}: expected {reference.lines} poses, as {reference.path} has, to pair them "
+            f"row by row (one of the two has no timestamps), got {estimate.lines}"
+        )
+    rows = []
+    for source in (estimate, reference):
+        if source.stamped and len(source.trajectory.t) < source.lines:
+            raise DataError(
+                f"{source.path}: expected a pose in every line, to pair them row by row with those of a file "
+                f"without timestamps, got {source}"
+            )
+        rows.append(np.arange(source.lines) if source.stamped else source.trajectory.t.astype(int))
+    _, of_estimate, of_reference = np.intersect1d(*rows, return_indices=True)
+    t = reference.trajectory.t[of_reference]
+    if not reference.stamped:
+        t = estimate.trajectory.t[of_estimate] + config.time_offset_s
+    T_estimate, T_reference = estimate.trajectory.T[of_estimate], reference.trajectory.T[of_reference]
+    stamped = reference.stamped or estimate.stamped
+    return _Pairs(t, T_estimate, T_reference, "row by row, as not both have timestamps", stamped)
+
+
+def _free(pairs: _Pairs, aligned: Float[np.ndarray, "n 4 4"]) -> str:
+    """What to say where positions do not determine the alignment; nothing where they do."""
+    what, spread = free_rotation(pairs.reference[:, :3, 3], aligned[:, :3, 3])
+    if what == "none":
+        return ""
+    path = "the path is straight" if what == "about the path" else "the camera stays in one place"
+    turned = "turning about it" if what == "about the path" else "any rotation"
+    return (
+        f"{path}, to {spread:.2g} m RMS: {turned} stays free in the alignment, so there is no rotation error "
+        "after it (RPE has that of the motion; --align none compares orientations as they are)"
+    )
 
 
 def _exact(config: Config, estimate: Source, reference: Source) -> _Pairs:
@@ -237,20 +283,20 @@ def _exact(config: Config, estimate: Source, reference: Source) -> _Pairs:
     if not reference.stamped:
         raise DataError(f"{reference.path}: expected timestamps for --match exact, got a {reference.what}")
     first, last = estimate.trajectory.t[[0, -1]]
-    t = reference.trajectory.t - config.time_offset_s
+    t = trajectories.since(reference.trajectory, round(config.time_offset_s * 1e9))
     inside = (t >= first) & (t <= last)
     if not inside.any():
+        apart = min(np.abs(t - first).min(), np.abs(t - last).min())
         raise DataError(
-            f"{reference.path}: expected timestamps from {first:.3f} to {last:.3f} s, as "
-            f"{estimate.path} has, "
-            f"got {t[0]:.3f} to {t[-1]:.3f} s; --time-offset-s brings them to one clock"
+            f"{reference.path}: expected timestamps from {estimate.span()}, as {estimate.path} has, got "
+            f"{reference.span()}, {apart:.3g} s apart; --time-offset-s brings them to one clock"
         )
     outside = len(t) - int(inside.sum())
     how = f"exact: the continuous trajectory ({FIELD}) at the reference's timestamps"
     how += f"; {outside} timestamps of the reference beyond its ends are left out" if outside else ""
     how += f"; the estimate's clock moved by {config.time_offset_s:g} s" if config.time_offset_s else ""
     of_reference = reference.trajectory.T[inside]
-    return _Pairs(reference.trajectory.t[inside], pose(t[inside]), of_reference, how, True, exact=True)
+    return _Pairs(t[inside], pose(t[inside]), of_reference, how, True, exact=True)
 
 
 def _consistency(config: Config, pairs: _Pairs, alignment: Similarity) -> dict[str, Consistency]:
@@ -269,7 +315,7 @@ def _consistency(config: Config, pairs: _Pairs, alignment: Similarity) -> dict[s
         )
     except ValueError as error:
         raise DataError(str(error)) from None
-    t = pairs.t - config.time_offset_s
+    t = pairs.t
     P = of_pose(t)
     aligned = trajectory_error.align(alignment, pairs.estimate)
     error = aligned_error(aligned, pairs.reference, P)
@@ -313,7 +359,7 @@ def _distance(delta: float, unit: Unit) -> str:
 
 def _row(name: str, unit: str, statistics: Statistics) -> tuple[str, ...]:
     values = (statistics.rmse, statistics.mean, statistics.median, statistics.max)
-    return (name, unit, *(f"{value:.6f}" for value in values))
+    return (name, unit, *("free" if np.isnan(value) else f"{value:.6f}" for value in values))
 
 
 def _line(name: str, text: str) -> str:

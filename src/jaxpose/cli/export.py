@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 import numpy as np
 import tyro
+from jaxtyping import Float
 
 from jaxpose.cli.source import FIELD, Source, images_on_disk, read_field, read_source
 from jaxpose.errors import DataError
@@ -21,14 +22,16 @@ from jaxpose.experiments.checks import check_apart, check_positive
 from jaxpose.experiments.command import Command, execute
 from jaxpose.experiments.progress import OnUpdate, Update, silent
 from jaxpose.files import atomic, trajectories
+from jaxpose.files.association import nearest
+from jaxpose.files.tables import seconds
+from jaxpose.files.timestamps import format_ns
 
 if TYPE_CHECKING:
     from jaxpose.geometry.camera import Camera
 
-Format = Literal["tum", "kitti", "euroc", "transforms", "colmap", "npz"]
-_OWN = (
-    1e-6  # [s] timestamps of a file closer than this are the same: float64 holds those since 1970 to 2.4e-7
-)
+Format = Literal["tum", "csv", "kitti", "euroc", "transforms", "colmap", "npz", "same"]
+_SAME: dict[str, Format] = {"TUM": "tum", "CSV": "csv", "KITTI": "kitti", "EuRoC": "euroc"}
+_OWN_NS = 1000  # timestamps closer than this are the same: others write float64 seconds since 1970, to 240 ns
 
 
 @dataclass(frozen=True)
@@ -36,13 +39,15 @@ class Config:
     """What to take out of a run, and where to put it."""
 
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]  # run folder, or trajectory file
-    # tum: `t tx ty tz qx qy qz qw`; kitti: 3x4 matrices without timestamps; euroc: csv with timestamps in ns;
+    # tum: `t tx ty tz qx qy qz qw`; csv: the same between commas; kitti: 3x4 matrices without timestamps;
+    # euroc: csv with timestamps in ns, quaternion wxyz; same: the one of these that RUN is a file of;
     # transforms: transforms.json for nerfstudio and instant-ngp; colmap: a text model; npz: the continuous
     # trajectory itself, which `jaxpose/fields/numpy_evaluator.py` evaluates with numpy alone.
     format: Format
     out: Path  # file to write; colmap: folder
     rate_hz: float | None = None  # [Hz] poses at this rate from the first frame on; None: at the frames
     at: Path | None = None  # poses at the timestamps of this file, the first number of each line ([s], or ns)
+    columns: str | None = None  # of a file that does not say what they hold: `t[us] tx ty tz qw qx qy qz`
     json: bool = False  # print what was written as JSON and nothing else
 
     def __post_init__(self):
@@ -80,25 +85,34 @@ def run(config: Config, on_update: OnUpdate = silent) -> Result:
         DataError, OSError: for what cannot be used; then nothing is written.
     """
     on_update(Update(f"reading {config.run}", quiet=True))
-    source = read_source(config.run)
+    source = read_source(config.run, config.columns)
     if config.format == "npz":
         return _continuous(config, source)
-    trajectory, times, notes = _chosen(config, source)
-    if not source.stamped and config.format in ("tum", "euroc"):
+    form: Format = config.format
+    if form == "same":
+        form = "tum" if source.file is None else _SAME.get(source.file.format, "same")
+    if form == "same":
         raise DataError(
-            f"{source.path}: expected timestamps for --format {config.format}, got a {source.what}"
+            f"{source.path}: expected a {', '.join(_SAME)} file for --format same, got a {source.what}"
         )
+    (trajectory, xyzw), times, notes = _chosen(config, source)
+    if not source.stamped and form in ("tum", "csv", "euroc"):
+        raise DataError(f"{source.path}: expected timestamps for --format {form}, got a {source.what}")
+    if form == "kitti" and source.lines > len(source.trajectory.t) and not source.stamped:
+        raise DataError(f"{source.path}: expected finite poses for --format kitti, got {source}")
     config.out.parent.mkdir(parents=True, exist_ok=True)
-    if config.format == "tum":
-        trajectories.write_tum(config.out, trajectory)
-    elif config.format == "euroc":
-        trajectories.write_euroc(config.out, trajectory)
-    elif config.format == "kitti":
+    if form == "tum":
+        trajectories.write_tum(config.out, trajectory, xyzw)
+    elif form == "csv":
+        trajectories.write_csv(config.out, trajectory, xyzw)
+    elif form == "euroc":
+        trajectories.write_euroc(config.out, trajectory, xyzw)
+    elif form == "kitti":
         trajectories.write_kitti(config.out, trajectory.T)
         notes += ("the format has no timestamps: line i is pose i",)
     else:
         notes += _with_images(config, source, trajectory)
-    return Result(str(source), config.out, config.format, len(trajectory.t), times, notes)
+    return Result(str(source), config.out, form, len(trajectory.t), times, notes)
 
 
 def main(args: Sequence[str] | None = None, prog: str = "jaxpose export") -> None:
@@ -118,43 +132,54 @@ def report(result: Result) -> str:
     return "\n".join(f"  {name:<8} {text}" for name, text in (*lines, *(("note", n) for n in result.notes)))
 
 
-def _chosen(config: Config, source: Source) -> tuple[trajectories.Trajectory, str, tuple[str, ...]]:
+class _Poses(NamedTuple):
+    trajectory: trajectories.Trajectory
+    quaternion_xyzw: Float[np.ndarray, "n 4"] | None = None  # as a file had them
+
+
+def _chosen(config: Config, source: Source) -> tuple[_Poses, str, tuple[str, ...]]:
     """The poses that are asked for, which times these are, and notes."""
-    t, T = source.trajectory
+    t, T, t0_ns = source.trajectory
     if config.rate_hz is not None:
         pose = read_field(source)
         count = int(np.floor((t[-1] - t[0]) * config.rate_hz * (1 + 1e-12))) + 1
         asked = t[0] + np.arange(count) / config.rate_hz
         times = f"of the continuous trajectory at {config.rate_hz:g} Hz"
-        return trajectories.Trajectory(asked, pose(asked)), times, ()
+        return _Poses(trajectories.Trajectory(asked, pose(asked))), times, ()
+    xyzw = None if source.file is None else source.file.quaternion_xyzw
     if config.at is None:
-        return source.trajectory, "those of the frames" if source.is_run else "those of the file", ()
-    asked = trajectories.read_timestamps(config.at)
+        return (
+            _Poses(source.trajectory, xyzw),
+            "those of the frames" if source.is_run else "those of the file",
+            (),
+        )
+    asked_ns = trajectories.read_timestamps(config.at)
+    asked = seconds(asked_ns, t0_ns)
     if not source.is_run:
-        rows = trajectories.nearest(asked, t)
-        strange = np.flatnonzero(~(np.abs(t[rows] - asked) < _OWN)) if source.stamped else np.arange(1)
+        rows = nearest(asked, t)
+        strange = (
+            np.flatnonzero(~(np.abs(t[rows] - asked) < 1e-9 * _OWN_NS)) if source.stamped else np.arange(1)
+        )
         if len(strange):
+            k = strange[0]
             raise DataError(
                 f"{config.at}: expected timestamps of {source.path}, as its motion between them is not "
-                f"known, "
-                f"got {asked[strange[0]]:.6f} s"
+                f"known, got {format_ns(asked_ns[k])} s, {abs(t[rows[k]] - asked[k]):.3g} s from the nearest"
             )
-        return trajectories.Trajectory(asked, T[rows]), f"those of {config.at}", ()
+        xyzw = None if xyzw is None else xyzw[rows]
+        return _Poses(trajectories.Trajectory(asked, T[rows], t0_ns), xyzw), f"those of {config.at}", ()
     pose = read_field(source)
     inside = (asked >= t[0]) & (asked <= t[-1])
     if not inside.any():
         raise DataError(
-            f"{config.at}: expected timestamps from {t[0]:.3f} to {t[-1]:.3f} s, as the run has, got "
-            f"{asked[0]:.3f} to {asked[-1]:.3f} s"
+            f"{config.at}: expected timestamps from {source.span()}, as the run has, got {asked[0]:.3f} to "
+            f"{asked[-1]:.3f} s"
         )
     left = len(asked) - int(inside.sum())
     notes = (f"{left} of {len(asked)} timestamps are beyond the ends of the run: left out",) if left else ()
     asked = asked[inside]
-    return (
-        trajectories.Trajectory(asked, pose(asked)),
-        f"of the continuous trajectory at those of {config.at}",
-        notes,
-    )
+    times = f"of the continuous trajectory at those of {config.at}"
+    return _Poses(trajectories.Trajectory(asked, pose(asked))), times, notes
 
 
 def _continuous(config: Config, source: Source) -> Result:
@@ -181,7 +206,7 @@ def _with_images(config: Config, source: Source, trajectory: trajectories.Trajec
             "names neither camera nor images"
         )
     camera, images, folder = read_camera(source.path / "camera.json")
-    t, T_world_cam = trajectory
+    t, T_world_cam, _ = trajectory
     if images and len(images) != len(t):
         raise DataError(f"{source.path}: expected {len(images)} poses, one an image, got {len(t)}")
     found, notes = images_on_disk(folder, images), ()

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from jaxpose.errors import DataError
 from jaxpose.files import trajectories
 from jaxpose.files.schema import choice
+from jaxpose.files.timestamps import format_ns
 from jaxpose.files.untrusted import read_json
 
 FIELD = "field.npz"
@@ -21,31 +22,50 @@ class Source(NamedTuple):
     path: Path
     what: str  # in words
     trajectory: trajectories.Trajectory
-    stamped: bool  # False: pose i is said to be at i seconds
-    is_run: bool
+    stamped: bool  # False: the pose of line i is said to be at i seconds
+    file: trajectories.TrajectoryFile | None = None  # None: a run
+
+    @property
+    def is_run(self) -> bool:
+        return self.file is None
+
+    @property
+    def lines(self) -> int:
+        """Poses that the source has, those left out among them."""
+        return len(self.trajectory.t) if self.file is None else self.file.count
 
     def __str__(self) -> str:
-        t = self.trajectory.t
-        span = f", {t[0]:.3f} to {t[-1]:.3f} s" if self.stamped else ", no timestamps"
-        return f"{self.path}  {self.what}, {len(t)} poses{span}"
+        span = f", {self.span()}" if self.stamped else ", no timestamps"
+        notes = "" if self.file is None else "".join(f" ({note})" for note in self.file.notes)
+        return f"{self.path}  {self.what}, {len(self.trajectory.t)} poses{span}{notes}"
+
+    def span(self) -> str:
+        """From when to when the poses are, on the source's own clock."""
+        first, last = (self.trajectory.t0_ns + round(s * 1e9) for s in self.trajectory.t[[0, -1]].tolist())
+        return f"{_milliseconds(first)} to {_milliseconds(last)} s"
 
 
-def read_source(path: Path) -> Source:
-    """Read a trajectory file or the trajectory of a run folder; DataError or OSError for what is neither."""
+def read_source(path: Path, columns: str | None = None) -> Source:
+    """Read a trajectory file or the trajectory of a run folder; DataError or OSError for what is neither.
+
+    `columns` names those of a file, as `read_trajectory` says.
+    """
     if not path.is_dir():
         if not path.exists():
             raise DataError(f"{path}: expected a trajectory file or a run folder, got nothing")
-        trajectory, name, stamped, repeated = trajectories.read_trajectory(path)
-        what = f"{name} file" + (f" ({repeated} left out: same timestamp as before)" if repeated else "")
-        return Source(path, what, trajectory, stamped, False)
+        file = trajectories.read_trajectory(path, columns)
+        return Source(path, f"{file.format} file", file.trajectory, file.has_timestamps, file)
+    if columns is not None:
+        raise DataError(f"{path}: expected a file for --columns {columns!r}, got a folder")
     file = path / "trajectory.txt"
     if not file.is_file():
         inner = sorted(folder.parent.name for folder in path.glob("*/trajectory.txt"))
         hint = f"runs in it: {', '.join(inner)}" if inner else "none"
         raise DataError(f"{path}: expected a run folder with trajectory.txt, got {hint}")
-    return Source(
-        path, f"{_experiment(path / 'results.json')} run".strip(), trajectories.read_tum(file), True, True
-    )
+    trajectory = trajectories.read_tum(file)
+    # A run's files are all on one clock, which its field takes as float64 seconds.
+    trajectory = trajectories.Trajectory(trajectories.since(trajectory, 0), trajectory.T)
+    return Source(path, f"{_experiment(path / 'results.json')} run".strip(), trajectory, True)
 
 
 def read_field(source: Source) -> Callable[[Float[np.ndarray, " n"]], Float[np.ndarray, "n 4 4"]]:
@@ -82,6 +102,11 @@ def images_on_disk(folder: Path, names: tuple[str, ...]) -> list[Path]:
     candidates = [[folder / name, *(folder / f"{name}{suffix}" for suffix in SUFFIXES)] for name in names]
     found = [next((file for file in files if file.is_file()), None) for files in candidates]
     return [] if None in found else [file for file in found if file is not None]
+
+
+def _milliseconds(ns: int) -> str:
+    whole, _, rest = format_ns(round(ns, -6)).partition(".")
+    return f"{whole}.{rest:0<3}"
 
 
 def _experiment(results: Path) -> str:

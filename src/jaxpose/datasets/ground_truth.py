@@ -3,7 +3,8 @@
 import numpy as np
 from jaxtyping import Float
 
-from jaxpose.files.trajectories import Trajectory, nearest
+from jaxpose.files.association import nearest
+from jaxpose.files.trajectories import Trajectory
 from jaxpose.imu.simulation import interpolant
 
 _MOST_GAP_S = 0.1  # between two true poses that one is interpolated from
@@ -22,5 +23,5 @@ def poses_at(ground_truth: Trajectory, t: Float[np.ndarray, " n"]) -> Float[np.n
     gap = ground_truth.t[after] - ground_truth.t[after - 1]
     known = (gap <= _MOST_GAP_S) | (np.abs(ground_truth.t[nearest(t, ground_truth.t)] - t) <= _AT_A_STAMP_S)
     inside = (t >= ground_truth.t[0]) & (t <= ground_truth.t[-1]) & known
-    poses[inside] = interpolant(*ground_truth).pose(t[inside])
+    poses[inside] = interpolant(ground_truth.t, ground_truth.T).pose(t[inside])
     return poses

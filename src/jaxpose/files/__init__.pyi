@@ -4,13 +4,13 @@ from . import colmap as colmap
 from . import ply as ply
 from . import run_folder as run_folder
 from . import trajectories as trajectories
+from .association import associate as associate
 from .colmap import read_colmap as read_colmap
 from .colmap import write_colmap as write_colmap
 from .ply import read_points as read_points
 from .ply import write_ply as write_ply
 from .trajectories import Trajectory as Trajectory
 from .trajectories import TrajectoryFile as TrajectoryFile
-from .trajectories import associate as associate
 from .trajectories import read_euroc as read_euroc
 from .trajectories import read_kitti as read_kitti
 from .trajectories import read_timestamps as read_timestamps

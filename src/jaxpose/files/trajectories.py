@@ -1,128 +1,219 @@
-"""Files of trajectories: TUM, KITTI, EuRoC (and TUM-VI), lists of 4x4 matrices; and pairs of timestamps."""
+"""Files of trajectories: TUM, KITTI, EuRoC (and TUM-VI), tables with a header, lists of 4x4 matrices."""
 
-from collections.abc import Callable
+from decimal import Decimal
 from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from jaxpose._checks import check_increasing, check_shapes
 from jaxpose.errors import DataError
 from jaxpose.files.atomic import write_text
-from jaxpose.files.tables import format_rows, numbered_lines, read_numbers
+from jaxpose.files.columns import joined_clock
+from jaxpose.files.layouts import (
+    EUROC,
+    KNOWN,
+    TUM,
+    Format,
+    Layout,
+    first_behind_comment,
+    pose_layout,
+    unit_quaternions,
+)
+from jaxpose.files.matrices import read_matrices, where_finite
+from jaxpose.files.tables import (
+    StampedRows,
+    format_rows,
+    left_out_notes,
+    read_numbers,
+    read_table,
+    stamped_rows,
+)
+from jaxpose.files.timestamps import Unit, format_seconds, origin, whole_ns
 from jaxpose.geometry import rigid
 
-Format = Literal["TUM", "KITTI", "EuRoC", "4x4 list"]
-_KNOWN = (
-    "TUM (8 numbers a line), KITTI (12), EuRoC or TUM-VI (commas, 8 or 17), or 4x4 matrices (16, or 4 x 4)"
-)
-_TUM_COLUMNS = "8 numbers (t tx ty tz qx qy qz qw)"
 _KITTI_COLUMNS = "12 numbers (the rows of a 3x4 pose)"
-_EUROC_COLUMNS = "17 numbers (timestamp, position, quaternion wxyz, velocity, biases) or the first 8 of them"
 _EUROC_NAMES = [f"p_RS_R_{axis} [m]" for axis in "xyz"] + [f"q_RS_{axis} []" for axis in "wxyz"]
-_MOST_OFF_ROTATION = 1e-2  # entries of a rotation matrix; more is not rounding
-_NANOSECONDS = 1e14  # a timestamp beyond it is in ns: as seconds it would be three million years off
+_CSV_NAMES = "t,tx,ty,tz,qx,qy,qz,qw"
 
 
 class Trajectory(NamedTuple):
     """Poses with timestamps.
 
     Attributes:
-        t: Timestamps (n,) [s], increasing, float64.
+        t: Timestamps (n,) [s] since `t0_ns`, increasing, float64.
         T: Poses (n, 4, 4), `T_world_cam` or of the body, float64 [m].
+        t0_ns: Where `t` is 0 on the file's own clock [ns]; 0 unless `t` would lose digits.
     """
 
     t: Float[np.ndarray, " n"]
     T: Float[np.ndarray, "n 4 4"]
+    t0_ns: int = 0
 
 
 class TrajectoryFile(NamedTuple):
     """What `read_trajectory` found.
 
     Attributes:
-        trajectory: The poses; without timestamps pose i is at i seconds.
+        trajectory: The poses; without timestamps the pose of line i, from 0, is at i seconds.
         format: The file's format.
         has_timestamps: Whether it has timestamps.
+        notes: What was left out, with counts, and what is unusual about the file.
         repeated: How many poses were left out, as their timestamp is that of the pose before.
+        missing: How many were left out, as they have NaN, infinity or a zero quaternion.
+        count: Lines of poses in the file, those left out among them.
+        unit: In which it has timestamps.
+        quaternion_xyzw: As the file has them, to the last digit; None for matrices.
+        order: Of its quaternions; None for matrices.
     """
 
     trajectory: Trajectory
     format: Format
     has_timestamps: bool
+    notes: tuple[str, ...]
     repeated: int
+    missing: int
+    count: int
+    unit: Unit | None = None
+    quaternion_xyzw: Float[np.ndarray, "n 4"] | None = None
+    order: Literal["xyzw", "wxyz"] | None = None
 
 
-def read_trajectory(path: Path | str) -> TrajectoryFile:
-    """Read a trajectory file, its format found by the separator and the number of columns of its first line.
+def read_trajectory(path: Path | str, columns: str | None = None) -> TrajectoryFile:
+    """Read a trajectory file, its format found by its header, its columns, and its timestamps.
 
-    TUM: `t tx ty tz qx qy qz qw`; EuRoC and TUM-VI: csv of timestamp [ns], position, quaternion wxyz; KITTI:
-    12 numbers, the rows of a 3x4 pose; 4x4 lists: 16 numbers a line or 4 lines of 4. Of poses with the same
-    timestamp the first is kept.
+    TUM: `t tx ty tz qx qy qz qw`, decimal seconds; EuRoC, TUM-VI, VINS: csv of timestamp [ns], position,
+    quaternion wxyz, and more; csv of decimal seconds, position, quaternion xyzw; any table whose header
+    names the eight; KITTI: 12 numbers, the rows of a 3x4 pose; 4x4 lists: 16 numbers a line or 4 lines of 4.
+    Timestamps of another unit than the format's are found by their size and steps. Of poses with the same
+    timestamp the first is kept; poses with NaN, infinity or a quaternion of zeros are left out; both are
+    counted.
 
     Args:
         path: The file.
+        columns: What its columns are called, such as `t[ns] tx ty tz qw qx qy qz`, any order, `-` for what
+            is not used; by default as its header or its layout says.
 
     Returns:
         The poses, and what the file is.
 
     Raises:
-        DataError: Naming file and line for what is none of the formats or is damaged.
+        DataError: Naming file and line for what is none of the formats or is damaged, for quaternions that
+            are not of unit length, and, with the readings that are possible, for what may be more than one.
     """
     path = Path(path)
-    content = numbered_lines(path)
-    if not content:
-        raise DataError(f"{path}: expected a trajectory, {_KNOWN}, got no line of numbers")
-    number, line = content[0]
-    if "," in line:
-        trajectory = read_euroc(path, first_of_repeated=True)
-        return TrajectoryFile(trajectory, "EuRoC", True, len(content) - len(trajectory.t))
-    columns = len(line.split())
-    if columns == 8:
-        trajectory = read_tum(path, first_of_repeated=True)
-        return TrajectoryFile(trajectory, "TUM", True, len(content) - len(trajectory.t))
-    if columns == 12:
-        return TrajectoryFile(read_kitti(path, rate_hz=1.0), "KITTI", False, 0)
-    if columns in (4, 16):
-        return TrajectoryFile(_read_matrices(path, columns), "4x4 list", False, 0)
-    raise DataError(f"{path}:{number}: expected a trajectory, {_KNOWN}, got {line[:60]!r}")
+    table = joined_clock(read_table(path))
+    if not table.lines:
+        raise DataError(f"{path}: expected a trajectory, {KNOWN}, got no line of numbers")
+    table, notes = first_behind_comment(table)
+    layout = pose_layout(path, table, columns)
+    if layout.columns is None:
+        return _matrices(path, layout.format)
+    rows = stamped_rows(
+        path, table, layout.words, layout.columns, unit=layout.unit, exact=layout.unit_is_stated
+    )
+    if layout.only_unit is not None and rows.unit != layout.only_unit:
+        raise DataError(
+            f"{path}: expected timestamps in {layout.only_unit}, as csv of {len(table.words[0])} columns "
+            f"without a header is EuRoC's or VINS', got {rows.unit}: say what they hold, --columns"
+        )
+    trajectory, quaternion_xyzw, rows = _poses(path, rows, layout)
+    notes += left_out_notes(path, rows)
+    if rows.unit != layout.unit:
+        notes += (f"{path.name}: timestamps are in {rows.unit}, by their size and steps",)
+    return TrajectoryFile(
+        trajectory,
+        layout.format,
+        True,
+        notes,
+        len(rows.repeated),
+        len(rows.missing),
+        len(table.lines),
+        rows.unit,
+        quaternion_xyzw,
+        layout.order,
+    )
 
 
-def read_tum(path: Path | str, *, first_of_repeated: bool = False) -> Trajectory:
-    """Read a TUM trajectory: lines of `t tx ty tz qx qy qz qw`, `#` comments; quaternions are normalised.
+def read_tum(path: Path | str) -> Trajectory:
+    """Read a whole TUM trajectory: lines of `t tx ty tz qx qy qz qw`, decimal seconds, `#` comments.
 
     Args:
-        path: The file.
-        first_of_repeated: Keep the first of poses with the same timestamp, which real ground truth has.
+        path: The file; `read_trajectory` reads what has gaps or other units.
 
     Returns:
-        Timestamps on the file's own clock, and poses.
+        Timestamps and poses.
 
     Raises:
         DataError: Naming file and line for a wrong number of columns, text or NaN where a number belongs, a
-            zero quaternion, or timestamps that repeat or go backwards.
+            quaternion that is not of unit length, or timestamps that repeat or go backwards.
     """
-    lines, values = read_numbers(Path(path), _TUM_COLUMNS, counts=(8,))
-    return _with_timestamps(Path(path), lines, values[:, 0], values[:, 1:4], values[:, 4:], first_of_repeated)
+    return _whole(Path(path), TUM, (8,), None)
 
 
-def write_tum(path: Path | str, trajectory: Trajectory) -> None:
+def read_euroc(path: Path | str) -> Trajectory:
+    """Read EuRoC's or TUM-VI's whole ground truth: csv of timestamp [ns], position, quaternion wxyz, and
+    more.
+
+    Args:
+        path: The file; `read_trajectory` reads what has gaps or other units.
+
+    Returns:
+        Timestamps, and poses `T_world_body`.
+
+    Raises:
+        DataError: As `read_tum`.
+    """
+    return _whole(Path(path), EUROC, (17, 8), ",")
+
+
+def since(trajectory: Trajectory, t0_ns: int) -> Float[np.ndarray, " n"]:
+    """The timestamps of a trajectory as seconds since another time on its clock.
+
+    Args:
+        trajectory: Poses with timestamps.
+        t0_ns: Where time is to be 0 [ns].
+
+    Returns:
+        Timestamps (n,) [s], which hold whole ns where they are below 1e6.
+    """
+    if t0_ns == trajectory.t0_ns:
+        return trajectory.t
+    return np.array([ns / 10**9 for ns in whole_ns(trajectory.t, trajectory.t0_ns - t0_ns)])
+
+
+def write_tum(
+    path: Path | str, trajectory: Trajectory, quaternion_xyzw: Float[np.ndarray, "n 4"] | None = None
+) -> None:
     """Write a TUM trajectory that reads back to the last bit (rotations to rounding).
 
     Args:
         path: The file, written whole or not at all.
         trajectory: Poses; those with NaN, such as ground truth that is missing, are left out.
+        quaternion_xyzw: Of the same rotations, as another file had them; by default made from them.
 
     Raises:
         ValueError: For arrays of other shapes, and for timestamps that do not increase.
     """
-    _check(trajectory)
-    finite = np.isfinite(trajectory.T).all((1, 2))
-    T = np.asarray(trajectory.T[finite], np.float64)
-    quaternion_xyzw = Rotation.from_matrix(T[:, :3, :3]).as_quat(canonical=True)
-    rows = np.column_stack([trajectory.t[finite], T[:, :3, 3], quaternion_xyzw])
-    write_text(path, "# timestamp tx ty tz qx qy qz qw\n" + format_rows(rows))
+    _write_seconds(Path(path), trajectory, quaternion_xyzw, " ", "# timestamp tx ty tz qx qy qz qw\n")
+
+
+def write_csv(
+    path: Path | str, trajectory: Trajectory, quaternion_xyzw: Float[np.ndarray, "n 4"] | None = None
+) -> None:
+    """Write csv of decimal seconds, position and quaternion xyzw under a header, as `t,tx,ty,tz,qx,qy,qz,qw`.
+
+    Args:
+        path: As `write_tum`.
+        trajectory: As `write_tum`.
+        quaternion_xyzw: As `write_tum`.
+
+    Raises:
+        ValueError: As `write_tum`.
+    """
+    _write_seconds(Path(path), trajectory, quaternion_xyzw, ",", f"#{_CSV_NAMES}\n")
 
 
 def read_kitti(path: Path | str, *, rate_hz: float = 10.0) -> Trajectory:
@@ -133,7 +224,7 @@ def read_kitti(path: Path | str, *, rate_hz: float = 10.0) -> Trajectory:
         rate_hz: Frames a second, as the format has no timestamps: frame i is at i / rate_hz seconds.
 
     Returns:
-        Timestamps from 0, and poses with rotations made orthonormal.
+        Timestamps from 0, and poses with rotations made orthonormal; NaN where the file has NaN or infinity.
 
     Raises:
         DataError: As `read_tum`, and for a matrix that is more than rounding off a rotation.
@@ -142,10 +233,11 @@ def read_kitti(path: Path | str, *, rate_hz: float = 10.0) -> Trajectory:
     if not 0 < rate_hz < np.inf:
         raise ValueError(f"rate_hz: expected a positive number, got {rate_hz}")
     path = Path(path)
-    lines, values = read_numbers(path, _KITTI_COLUMNS, counts=(12,))
+    table = read_table(path)
+    lines, values = read_numbers(path, _KITTI_COLUMNS, counts=(12,), separator=table.separator, finite=False)
     rows = values.reshape(-1, 3, 4)
-    T = rigid.make(rows[..., :3], rows[..., 3])
-    return Trajectory(np.arange(len(T)) / rate_hz, orthonormal(T, lambda i: f"{path}:{lines[i]}"))
+    T = where_finite(rigid.make(rows[..., :3], rows[..., 3]), lambda i: f"{path}:{lines[i]}")
+    return Trajectory(np.arange(len(T)) / rate_hz, T)
 
 
 def write_kitti(path: Path | str, T_world_cam: Float[np.ndarray, "n 4 4"]) -> None:
@@ -166,30 +258,15 @@ def write_kitti(path: Path | str, T_world_cam: Float[np.ndarray, "n 4 4"]) -> No
     write_text(path, format_rows(T_world_cam[:, :3].reshape(-1, 12)))
 
 
-def read_euroc(path: Path | str, *, first_of_repeated: bool = False) -> Trajectory:
-    """Read EuRoC's or TUM-VI's ground truth: csv of timestamp [ns], position, quaternion wxyz, and more.
-
-    Args:
-        path: The file.
-        first_of_repeated: Keep the first of poses with the same timestamp.
-
-    Returns:
-        `T_world_body` at seconds since 1970, which float64 resolves to 0.24 microseconds.
-
-    Raises:
-        DataError: As `read_tum`.
-    """
-    lines, values = read_numbers(Path(path), _EUROC_COLUMNS, counts=(17, 8), separator=",")
-    t, quaternion_xyzw = values[:, 0] / 1e9, values[:, [5, 6, 7, 4]]
-    return _with_timestamps(Path(path), lines, t, values[:, 1:4], quaternion_xyzw, first_of_repeated)
-
-
-def write_euroc(path: Path | str, trajectory: Trajectory) -> None:
+def write_euroc(
+    path: Path | str, trajectory: Trajectory, quaternion_xyzw: Float[np.ndarray, "n 4"] | None = None
+) -> None:
     """Write the first 8 columns of EuRoC's ground truth, which are all that TUM-VI's has.
 
     Args:
         path: The file, written whole or not at all.
         trajectory: Poses; timestamps are written in whole ns.
+        quaternion_xyzw: Of the same rotations, as another file had them; by default made from them.
 
     Raises:
         DataError: For poses with NaN, and for timestamps less than a nanosecond apart.
@@ -199,163 +276,118 @@ def write_euroc(path: Path | str, trajectory: Trajectory) -> None:
     finite = np.isfinite(trajectory.T).all((1, 2))
     if not finite.all():
         raise DataError(f"{path}: expected finite poses, got NaN or infinity in row {finite.argmin()}")
-    ns = [round(t * 1e9) for t in trajectory.t.tolist()]
+    ns = whole_ns(trajectory.t, trajectory.t0_ns)
     if (np.diff(ns) <= 0).any():
         raise DataError(f"{path}: expected timestamps at least 1 ns apart, got closer ones")
-    quaternion_wxyz = Rotation.from_matrix(trajectory.T[:, :3, :3]).as_quat(canonical=True, scalar_first=True)
+    quaternion_wxyz = _quaternions(trajectory, quaternion_xyzw)[:, [3, 0, 1, 2]]
     rows = np.column_stack([trajectory.T[:, :3, 3], quaternion_wxyz]).tolist()
     lines = [",".join(map(repr, [timestamp, *row])) + "\n" for timestamp, row in zip(ns, rows, strict=True)]
     write_text(path, f"#timestamp [ns],{','.join(_EUROC_NAMES)}\n" + "".join(lines))
 
 
-def read_timestamps(path: Path | str) -> Float[np.ndarray, " n"]:
+def read_timestamps(path: Path | str) -> list[int]:
     """Read the timestamps that begin the lines of a file: a trajectory, an IMU, a list of images.
 
     Args:
         path: The file; its columns are separated by commas or blanks.
 
     Returns:
-        Timestamps [s], increasing; those above 1e14 in the file are taken as nanoseconds.
+        Timestamps [ns], increasing; the unit in which the file has them is found by their size and steps.
 
     Raises:
         DataError: Naming file and line for text, and for timestamps that repeat or go backwards.
     """
-    path, lines, timestamps = Path(path), [], []
-    for number, line in numbered_lines(path):
-        try:
-            timestamp = float(line.replace(",", " ").split()[0])
-        except (ValueError, IndexError):
-            timestamp = np.nan
-        if not np.isfinite(timestamp):
-            raise DataError(
-                f"{path}:{number}: expected a line that begins with a timestamp, got {line[:60]!r}"
-            )
-        lines.append(number)
-        timestamps.append(timestamp)
-    if not timestamps:
-        raise DataError(f"{path}: expected lines that begin with a timestamp, got none")
-    t = np.array(timestamps)
-    t = t / 1e9 if np.abs(t).max() > _NANOSECONDS else t
-    _check_after(path, lines, t)
-    return t
+    path = Path(path)
+    table, wanted = read_table(path), "a line that begins with a timestamp"
+    first = table._replace(words=[words[:1] for words in table.words])
+    rows = stamped_rows(path, first, wanted, (0,), unit="s")
+    if rows.repeated or rows.missing:
+        line = min(rows.repeated or rows.missing)
+        got = "a repeated one" if rows.repeated else "NaN"
+        raise DataError(f"{path}:{line}: expected a timestamp after that before, got {got}")
+    return rows.ns
 
 
-def orthonormal(T: Float[np.ndarray, "n 4 4"], where: Callable[[int], str]) -> Float[np.ndarray, "n 4 4"]:
-    """Poses with rotations orthonormal to the last digit.
-
-    Args:
-        T: Poses (n, 4, 4) of which the rotations may be off by rounding, up to 0.01.
-        where: Names the source of pose i in an error.
-
-    Returns:
-        Poses (n, 4, 4).
-
-    Raises:
-        DataError: With `where(i)` for the worst, pose i, if it is more than rounding off a rotation.
-    """
-    rotation = rigid.nearest_rotation(T[:, :3, :3])
-    off = np.abs(T[:, :3, :3] - rotation).max(axis=(1, 2))
-    if off.max() > _MOST_OFF_ROTATION:
-        raise DataError(
-            f"{where(int(off.argmax()))}: expected a rotation, got a matrix {off.max():.2g} off one"
-        )
-    return rigid.make(rotation, T[:, :3, 3])
+def _whole(path: Path, layout: Layout, counts: tuple[int, ...], separator: str | None) -> Trajectory:
+    """A trajectory in a stated format, without gaps."""
+    assert layout.columns is not None
+    table = read_table(path)
+    if table.lines and (len(table.words[0]) not in counts or table.separator != separator):
+        got = len(table.words[0]) if table.separator == separator else repr(" ".join(table.words[0])[:60])
+        raise DataError(f"{path}:{table.lines[0]}: expected {layout.words}, got {got}")
+    rows = stamped_rows(path, table, layout.words, layout.columns, unit=layout.unit, exact=True)
+    trajectory, _, rows = _poses(path, rows, layout)
+    for line in sorted((*rows.missing, *rows.repeated))[:1]:
+        got = "a repeated one" if line in rows.repeated else "NaN, infinity or a zero quaternion"
+        wanted = "a timestamp after that before" if line in rows.repeated else "finite numbers"
+        raise DataError(f"{path}:{line}: expected {wanted}, got {got}")
+    return trajectory
 
 
-def associate(
-    t_a: Float[np.ndarray, " a"], t_b: Float[np.ndarray, " b"], max_difference: float = 0.01
-) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
-    """Pair timestamps of two lists by nearness.
-
-    Every timestamp of the shorter list (of `t_b` if equally long) takes the nearest of the longer, the
-    earlier of two equally near; one timestamp of the longer may serve two.
-
-    Args:
-        t_a: Timestamps (a,) [s], increasing.
-        t_b: Timestamps (b,) [s], increasing.
-        max_difference: Pairs farther apart [s] are left out.
-
-    Returns:
-        Indices into both lists, (m,) each.
-
-    Raises:
-        DataError: If no pair is near enough.
-        ValueError: For timestamps that do not increase.
-
-    >>> [rows.tolist() for rows in associate(np.array([0.0, 1.0, 2.0]), np.array([1.004, 5.0]))]
-    [[1], [0]]
-    """
-    check_increasing(t_a=t_a, t_b=t_b)
-    if len(t_b) <= len(t_a):
-        near_a, near_b = nearest(t_b, t_a), np.arange(len(t_b))
-    else:
-        near_a, near_b = np.arange(len(t_a)), nearest(t_a, t_b)
-    close = np.abs(t_a[near_a] - t_b[near_b]) <= max_difference
-    if not close.any():
-        spans = [f"{t[0]:.3f} to {t[-1]:.3f} s" if len(t) else "no timestamps" for t in (t_a, t_b)]
-        raise DataError(
-            f"trajectories: expected timestamps within {max_difference} s, got {' and '.join(spans)}"
-        )
-    return near_a[close], near_b[close]
+def _poses(
+    path: Path, rows: StampedRows, layout: Layout
+) -> tuple[Trajectory, Float[np.ndarray, "n 4"], StampedRows]:
+    """The poses, the quaternions xyzw as written, and the rows without those whose quaternion is zero."""
+    norm = unit_quaternions(path, rows.lines, rows.values, layout.order)
+    there = norm > 0.5
+    if not there.any():
+        raise DataError(f"{path}:{rows.lines[0]}: expected a unit quaternion, got zero")
+    kept = np.flatnonzero(there)
+    zero = tuple(rows.lines[i] for i in np.flatnonzero(~there))
+    rows = rows._replace(
+        lines=[rows.lines[i] for i in kept],
+        ns=[rows.ns[i] for i in kept],
+        values=rows.values[kept],
+        missing=tuple(sorted((*rows.missing, *zero))),
+        written_s=tuple(rows.written_s[i] for i in kept),
+    )
+    t0_ns, xyzw = origin(rows.ns), rows.values[:, 3:]
+    t = np.array([float(s - Decimal(t0_ns) / 10**9) for s in rows.written_s])
+    T = rigid.make(Rotation.from_quat(xyzw).as_matrix(), rows.values[:, :3])
+    return Trajectory(t, T, t0_ns), xyzw, rows
 
 
-def nearest(t: Float[np.ndarray, " n"], among: Float[np.ndarray, " m"]) -> Int[np.ndarray, " n"]:
-    """Find the nearest timestamp.
-
-    Args:
-        t: Times (n,) [s].
-        among: Timestamps (m,) [s], increasing.
-
-    Returns:
-        Indices (n,) into `among`, of the earlier of two equally near.
-
-    >>> nearest(np.array([0.4, 0.6, 9.0]), np.array([0.0, 1.0, 2.0])).tolist()
-    [0, 1, 2]
-    """
-    after = np.minimum(np.searchsorted(among, t, side="right"), len(among) - 1)
-    before = np.maximum(after - 1, 0)
-    return np.where(np.abs(among[after] - t) < np.abs(t - among[before]), after, before)
+def _matrices(path: Path, form: Format) -> TrajectoryFile:
+    """A list of poses without timestamps; those with NaN are left out, and the others keep their numbers."""
+    T = read_kitti(path).T if form == "KITTI" else read_matrices(path)
+    there = np.isfinite(T).all((1, 2))
+    if not there.any():
+        raise DataError(f"{path}: expected finite poses, got NaN or infinity in all {len(T)}")
+    missing = len(T) - int(there.sum())
+    notes = (f"{path.name}: poses left out: {missing} with NaN or infinity",) if missing else ()
+    t = np.flatnonzero(there).astype(np.float64)
+    return TrajectoryFile(Trajectory(t, T[there]), form, False, notes, 0, missing, len(T))
 
 
-def _check_after(path: Path, lines: list[int], t: Float[np.ndarray, " n"]) -> None:
-    """DataError naming file and line for the first timestamp [s] that is not after the one before."""
-    for row in np.flatnonzero(np.diff(t) <= 0) + 1:
-        raise DataError(f"{path}:{lines[row]}: expected a timestamp after {t[row - 1]!s} s, got {t[row]!s} s")
-
-
-def _read_matrices(path: Path, columns: int) -> Trajectory:
-    """Poses as whole 4x4 matrices, one in each line or in each four."""
-    lines, values = read_numbers(path, f"{columns} numbers of 4x4 poses", counts=(columns,))
-    if values.size % 16:
-        raise DataError(f"{path}: expected four lines for each pose, got {len(values)} lines")
-    T = values.reshape(-1, 4, 4)
-    first_lines = lines[:: len(lines) // len(T)]
-    off = np.abs(T[:, 3] - [0, 0, 0, 1]).max(axis=1)
-    if off.max() > 1e-6:
-        found = " ".join(f"{number:g}" for number in T[off.argmax(), 3])
-        raise DataError(
-            f"{path}:{first_lines[off.argmax()]}: expected a last row 0 0 0 1 of the pose, got {found}"
-        )
-    return Trajectory(np.arange(float(len(T))), orthonormal(T, lambda i: f"{path}:{first_lines[i]}"))
-
-
-def _with_timestamps(
+def _write_seconds(
     path: Path,
-    lines: list[int],
-    t: Float[np.ndarray, " n"],
-    translation: Float[np.ndarray, "n 3"],
-    quaternion_xyzw: Float[np.ndarray, "n 4"],
-    first_of_repeated: bool,
-) -> Trajectory:
-    """A trajectory from columns, their values checked."""
-    for row in np.flatnonzero(np.linalg.norm(quaternion_xyzw, axis=1) < 1e-6):
-        raise DataError(f"{path}:{lines[row]}: expected a unit quaternion, got zero")
-    if first_of_repeated:
-        kept = np.append(True, np.diff(t) != 0)
-        lines = [line for line, keep in zip(lines, kept, strict=True) if keep]
-        t, translation, quaternion_xyzw = t[kept], translation[kept], quaternion_xyzw[kept]
-    _check_after(path, lines, t)
-    return Trajectory(t, rigid.make(Rotation.from_quat(quaternion_xyzw).as_matrix(), translation))
+    trajectory: Trajectory,
+    quaternion_xyzw: Float[np.ndarray, "n 4"] | None,
+    separator: str,
+    header: str,
+) -> None:
+    _check(trajectory)
+    xyzw = _quaternions(trajectory, quaternion_xyzw)
+    finite = np.flatnonzero(np.isfinite(trajectory.T).all((1, 2)))
+    times = format_seconds(trajectory.t[finite], trajectory.t0_ns)
+    rows = format_rows(np.hstack([trajectory.T[finite, :3, 3], xyzw[finite]])).splitlines()
+    lines = [separator.join([t, *row.split()]) + "\n" for t, row in zip(times, rows, strict=True)]
+    write_text(path, header + "".join(lines))
+
+
+def _quaternions(
+    trajectory: Trajectory, quaternion_xyzw: Float[np.ndarray, "n 4"] | None
+) -> Float[np.ndarray, "n 4"]:
+    """Those given, else those of the rotations, NaN where there is none."""
+    if quaternion_xyzw is not None:
+        check_shapes(t=(trajectory.t, "n"), quaternion_xyzw=(quaternion_xyzw, "n 4"))
+        return quaternion_xyzw
+    finite = np.flatnonzero(np.isfinite(trajectory.T).all((1, 2)))
+    xyzw = np.full((len(trajectory.T), 4), np.nan)
+    if len(finite):
+        R = np.asarray(trajectory.T[finite, :3, :3], np.float64)
+        xyzw[finite] = Rotation.from_matrix(R).as_quat(canonical=True)
+    return xyzw
 
 
 def _check(trajectory: Trajectory) -> None:

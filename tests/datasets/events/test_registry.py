@@ -89,7 +89,7 @@ def test_repeated_poses_are_told(made):
     (folder / "poses.txt").write_text(POSES + POSES.splitlines()[1] + "\n")
     recording = load(folder)
     assert len(recording.t) == 2
-    assert "1 lines of poses.txt repeat the timestamp before them and are ignored" in recording.notes
+    assert "poses.txt: lines left out: 1 repeat the timestamp before (line 3)" in recording.notes
 
 
 def test_archives_with_bad_events_are_refused(made):

@@ -205,11 +205,11 @@ SHEET = CAMERA_SHEET.format(pose="1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1
         ),
         (
             "cam0/data.csv",
-            "#h\n1.5,a.png\n",
-            "cam0/data.csv:2: expected a timestamp in ns and a file name, got '1.5",
+            "#h\nx,a.png\n",
+            "cam0/data.csv:2: expected a timestamp in ns and a file name, got 'x",
         ),
         ("cam0/data.csv", "5\n", "cam0/data.csv:1: expected a timestamp in ns and a file name"),
-        ("cam0/data.csv", "5,a.png\n5,b.png\n", "cam0/data.csv:2: expected a timestamp after 5, got 5"),
+        ("cam0/data.csv", "5,a.png\n5,b.png\n", "cam0/data.csv:2: expected a timestamp after 0.000000005 s"),
         ("cam0/data.csv", "5,a.png\n", "cam0/data/a.png: expected an image, got nothing"),
         ("cam0/sensor.yaml", None, "cam0/sensor.yaml: expected a file, got none"),
         (

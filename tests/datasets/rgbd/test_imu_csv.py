@@ -71,7 +71,7 @@ def test_both_layouts_give_the_same_readings(desk, walk):
     text = desk / "imu.txt"
     np.savetxt(text, np.column_stack([seconds, omega, force]), fmt="%.17g", header="t w w w a a a")
     for file, t0_ns in (desk / "imu.csv", T0_NS), (text, 0):
-        imu = read_imu(file, t0_ns)
+        imu = read_imu(file).since(t0_ns)
         np.testing.assert_allclose(imu.t, seconds, rtol=0, atol=1e-9)
         np.testing.assert_array_equal(imu.omega_body, omega)
         np.testing.assert_array_equal(imu.acceleration_body, force)
@@ -138,13 +138,22 @@ def test_a_mounting_that_is_none_is_named(tmp_path, text, message):
 @pytest.mark.parametrize(
     "text, message",
     [
-        ("", ": expected lines of 7 numbers (t wx wy wz ax ay az), got none"),
-        ("0 1 2 3 4 5\n", ":1: expected 7 numbers (t wx wy wz ax ay az), got 6"),
-        ("0 1 2 3 4 5 6\n0 1 2 3 4 5 6\n", ":2: expected a timestamp after 0.0 s, got 0.0 s"),
+        ("", ": expected lines of 7 columns (t wx wy wz ax ay az), got none"),
+        ("0 1 2 3 4 5\n", ":1: expected 7 columns (t wx wy wz ax ay az), or a header that names them, got 6"),
+        ("0 1 2 3 4 5 6\n0 1 2 3 4 5 6\n", ": expected at least 2 readings, got 1"),
+        ("0 1 2 3 4 5 6\n1 1 2 3 4 5\n", ":2: expected 7 columns (t wx wy wz ax ay az), got 6"),
+        ("0.1 1 2 3 4 5 6\n0 1 2 3 4 5 6\n", ":2: expected a timestamp after 0.1 s, got 0.0 s"),
         ("0 1 2 3 4 5 6\n", ": expected at least 2 readings, got 1"),
-        ("0 1 2 3 4 5 nan\n", ":1: expected finite numbers"),
-        ("0.5,1,2,3,4,5,6\n", ":1: expected a timestamp in ns and numbers, got '0.5,1,2,3,4,5,6'"),
-        ("#t\n1,1,2,3,4,5\n", ":2: expected 7 columns (timestamp, 3 rates, 3 accelerations), got 6"),
+        ("0 1 2 3 4 5 x\n", ":1: expected 7 columns (t wx wy wz ax ay az), got '0 1 2 3 4 5 x'"),
+        (
+            "0 1 2 3 4 5 nan\n",
+            ": expected lines of 7 columns (t wx wy wz ax ay az), got NaN or infinity in all",
+        ),
+        ("#t\n1,1,2,3,4,5\n", ":2: expected 7 columns (t wx wy wz ax ay az), or a header that names them"),
+        (
+            "0,1,2,3,4,5,6\n100000,1,2,3,4,5,6\n",
+            "of one meaning, got 0 to 100000 in 2 lines, which may be ns or us",
+        ),
     ],
 )
 def test_a_file_of_readings_that_is_none_is_named(tmp_path, text, message):
@@ -152,7 +161,7 @@ def test_a_file_of_readings_that_is_none_is_named(tmp_path, text, message):
     file.write_text(text)
     with pytest.raises(DataError) as error:
         read_imu(file)
-    assert f"{file}{message}" in str(error.value)
+    assert str(file) in str(error.value) and message in str(error.value) and "\n" not in str(error.value)
 
 
 def test_readings_of_another_time_are_refused_and_gaps_told(desk, walk):
@@ -221,7 +230,7 @@ def test_the_options_go_together_and_a_missing_file_is_one_line(desk):
 def test_a_real_flight_agrees_with_gravity_as_mounted_and_not_when_turned(data_dir):
     folder = data_dir / "euroc_V1_02_medium" / "mav0"
     rows = np.loadtxt(folder / "imu0" / "data.csv", delimiter=",", comments="#")
-    imu = read_imu(folder / "imu0" / "data.csv")
+    imu = read_imu(folder / "imu0" / "data.csv").since(0)
     np.testing.assert_allclose(imu.t, rows[:, 0] * 1e-9, rtol=0, atol=1e-6)
     np.testing.assert_array_equal(np.hstack([imu.omega_body, imu.acceleration_body]), rows[:, 1:])
     ground_truth = np.loadtxt(
@@ -238,3 +247,54 @@ def test_a_real_flight_agrees_with_gravity_as_mounted_and_not_when_turned(data_d
     assert imu_notes(recording, "imu0") == ()
     (note,) = imu_notes(recording._replace(T_body_cam=np.eye(4)), "imu0")
     assert "check unit and extrinsics" in note
+
+
+def written(path, text):
+    path.write_text(text)
+    return read_imu(path)
+
+
+def test_units_of_time_are_found_by_size_and_steps(tmp_path):
+    """The same 200 Hz in four units, since 1970 and since the start; between commas and blanks."""
+    numbers = " 1 2 3 4 5 6"
+    for start_us in (0, 1_403_715_523_912_143):
+        times_us = [start_us + 5000 * k for k in range(8)]
+        for unit, write in {
+            "ns": lambda us: f"{1000 * us}",
+            "us": lambda us: f"{us}",
+            "ms": lambda us: f"{us // 1000}.{us % 1000:03d}",
+            "s": lambda us: f"{us // 10**6}.{us % 10**6:06d}",
+        }.items():
+            lines = [write(us) + numbers for us in times_us]
+            for name, mark in (("blanks", " "), ("commas", ",")):
+                found = written(tmp_path / name, "\n".join(line.replace(" ", mark) for line in lines) + "\n")
+                assert found.ns == [1000 * us for us in times_us], (unit, name)
+                assert found.unit == unit
+                assert bool(found.notes) == (unit != ("s" if mark == " " else "ns"))
+
+
+def test_a_header_says_which_column_is_what_and_in_which_unit(tmp_path):
+    """The accelerometer first, as phones write it; degrees and g by the header, a column of text between."""
+    found = written(
+        tmp_path / "phone.csv",
+        "time [us],sensor,acc_x [g],acc_y [g],acc_z [g],gyr_x [deg/s],gyr_y [deg/s],gyr_z [deg/s],\n"
+        "0,a,0,0,1,180,0,90,\n10000,b,0,0.5,1,0,360,0,\n",
+    )
+    np.testing.assert_allclose(found.omega_body, np.pi * np.array([[1, 0, 0.5], [0, 2, 0]]), atol=1e-12)
+    np.testing.assert_allclose(found.acceleration_body, G * np.array([[0, 0, 1], [0, 0.5, 1]]), atol=1e-12)
+    assert found.ns == [0, 10_000_000] and len(found.notes) == 2
+    split = "#sec,nsec,ax,ay,az,gx,gy,gz\n7,5,1,2,3,4,5,6\n7,5000005,1,2,3,4,5,6\n"
+    found = written(tmp_path / "split.csv", split)
+    assert found.ns == [7_000_000_005, 7_005_000_005] and found.omega_body[0].tolist() == [4, 5, 6]
+
+
+def test_gaps_of_readings_are_left_out_and_counted(tmp_path):
+    rows = [f"{5_000_000 * k},1,2,3,4,5,{k}" for k in range(6)]
+    rows[1] = rows[1].replace(",5,", ",nan,")
+    rows[3] = rows[3].replace(",5,", ",,")
+    found = written(tmp_path / "imu.csv", "\n".join([*rows, rows[-1]]) + "\n")
+    assert found.acceleration_body[:, 2].tolist() == [0, 2, 4, 5] and found.gaps == 3
+    assert found.notes == (
+        "imu.csv: lines left out: 2 hold NaN, infinity or nothing (line 2), "
+        "1 repeat the timestamp before (line 7)",
+    )

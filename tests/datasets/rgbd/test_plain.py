@@ -152,8 +152,12 @@ def test_unusable_json_is_named(desk, values, message):
     "file, content, message",
     [
         ("times.txt", "1\n2\n", "times.txt: expected 6 lines, one for each colour image, got 2"),
-        ("times.txt", "1\n2\n3\n3\n4\n5\n", "times.txt:4: expected a timestamp after 3.0 s, got 3.0 s"),
-        ("times.txt", "1\ntwo\n", "times.txt:2: expected 1 number"),
+        (
+            "times.txt",
+            "1\n2\n3\n3\n4\n5\n",
+            "times.txt:4: expected a timestamp after that before, got a repeated one",
+        ),
+        ("times.txt", "1\ntwo\n", "times.txt:2: expected a line that begins with a timestamp"),
         (
             "poses.txt",
             "1 2 3\n",

@@ -233,7 +233,8 @@ def test_the_first_of_lines_with_one_stamp_counts(desk, walk):
     file.write_text("\n".join([*lines, " ".join([last[0], "9", "9", "9", *last[4:]])]))
     recording = tum.load(desk)
     np.testing.assert_allclose(recording.T_world_cam[4], walk.T_world_cam[5], atol=1e-9)
-    assert "1 lines of groundtruth.txt repeat the timestamp before them and are ignored" in recording.notes
+    note = f"groundtruth.txt: lines left out: 1 repeat the timestamp before (line {len(lines) + 1})"
+    assert note in recording.notes
     file.write_text("\n".join([*lines, "1 0 0 0 0 0 0 1"]))
     with pytest.raises(DataError, match=f"groundtruth.txt:{len(lines) + 1}: expected a timestamp after"):
         tum.load(desk)

@@ -7,13 +7,12 @@ import numpy as np
 from jaxpose.cli.check.findings import Checked, Fact, Finding, join, unusable
 from jaxpose.cli.check.poses import check_poses
 from jaxpose.cli.check.recording import check_camera
-from jaxpose.cli.check.timestamps import check_stamps
+from jaxpose.cli.check.timestamps import stamps_of
 from jaxpose.cli.check.trajectory import check_trajectory
 from jaxpose.datasets.events import registry as event_registry
 from jaxpose.datasets.events.stream import Stream, StreamStats, count, in_words, reach
 from jaxpose.datasets.types import EventRecording
 from jaxpose.errors import DataError
-from jaxpose.files.tables import read_unchecked
 
 _MOST = 500_000  # events that are looked at: recordings have hundreds of millions
 _RATES_HZ = (1e2, 1e9)
@@ -76,7 +75,7 @@ def _beside(folder: Path) -> list[Checked]:
     """Timestamps of frames, and true poses."""
     parts = []
     if (folder / "images.txt").is_file():
-        parts.append(check_stamps("images.txt", read_unchecked(folder / "images.txt")[:, 0], gaps="warning"))
+        parts.append(stamps_of(folder / "images.txt", gaps="warning"))
     for file in (folder / "groundtruth.txt", folder / "poses.txt"):
         if file.is_file():
             checked = check_trajectory(file)[1]

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from jaxpose.cli.check.findings import Checked, Fact, Finding
 from jaxpose.cli.check.poses import Order, reorder
+from jaxpose.cli.check.readings import STANDARD
 from jaxpose.geometry import rigid
 from jaxpose.imu import Imu
 
@@ -20,8 +21,6 @@ _AGREE, _BETTER, _SAME = 0.9, 0.1, 0.005  # correlations
 _OFFSET_S, _OFF_DEG = 0.01, 5.0  # clock and mounting: more is told
 _GYRO_BIAS = 0.3  # rad/s
 _MOST_BIAS = 1.0  # m/s^2
-_STANDARD = 9.80665
-_UNITS = {"m/s^2": 1.0, "g": 1 / _STANDARD, "cm/s^2 (Gal)": 100.0, "mm/s^2": 1e3, "mg": 1e3 / _STANDARD}
 
 
 class _Match(NamedTuple):
@@ -38,10 +37,14 @@ def check_imu(
     imu: Imu,
     t: Float[np.ndarray, " n"],
     T_world_body: Float[np.ndarray, "n 4 4"],
-    R_body_imu: Float[np.ndarray, "3 3"],
+    R_body_imu: Float[np.ndarray, "3 3"] | None,
     read_as: Order = "wxyz",
+    gyroscope_named: bool = False,
 ) -> Checked:
-    """Readings against poses on the same clock, both as the files state them; z is taken to point up."""
+    """Readings in SI against poses on the same clock; z is taken to point up.
+
+    `R_body_imu` is the stated mounting, None where none is; `gyroscope_named`: its fault is known already.
+    """
     rates = {
         "poses as read": T_world_body,
         "world-to-body poses (inverted)": rigid.inverse(T_world_body),
@@ -52,20 +55,20 @@ def check_imu(
         note = "the poses turn too little, or overlap too little with the IMU, to test it against them"
         return Checked(notes=(note,))
     given = matches["poses as read"]
-    off_deg = {name: _angle_deg(match.R_body_imu @ R_body_imu.T) for name, match in matches.items()}
+    stated = given.R_body_imu if R_body_imu is None else R_body_imu
+    off_deg = {name: _angle_deg(match.R_body_imu @ stated.T) for name, match in matches.items()}
     off = off_deg["poses as read"]
+    mounting = "not stated" if R_body_imu is None else f"{off:.1f} deg from the stated"
     text = f"gyroscope and poses: correlation {given.correlation:.3f}, clock offset "
-    text += f"{1e3 * given.offset_s:.1f} ms, mounting {off:.1f} deg from the stated, "
+    text += f"{1e3 * given.offset_s:.1f} ms, mounting {mounting}, "
     text += f"bias {np.round(given.bias, 4).tolist()} rad/s"
     numbers = {"correlation": given.correlation, "offset_s": given.offset_s, "rotation_deg": off}
     numbers |= {"gyro_ratio": given.ratio, "gyro_bias": float(np.linalg.norm(given.bias))}
     fact = Fact("IMU and poses", text, numbers)
-    force = _force_unit(imu)
     if given.correlation < _AGREE:
-        return Checked((fact,), (_wrong_poses(matches, off_deg), force))
-    findings = [*_rates(given, off), force]
-    if force.severity == "ok":
-        findings.append(_gravity(imu, t + given.offset_s, T_world_body @ _turned(R_body_imu)))
+        return Checked((fact,), (_wrong_poses(matches, off_deg),))
+    findings = _rates(given, off, gyroscope_named)
+    findings.append(_gravity(imu, t + given.offset_s, T_world_body @ _turned(stated)))
     return Checked((fact,), tuple(findings))
 
 
@@ -87,9 +90,9 @@ def _wrong_poses(matches: dict[str, _Match], off_deg: dict[str, float]) -> Findi
     return Finding("warning", test, found, expected, "invert the poses")
 
 
-def _rates(match: _Match, off_deg: float) -> list[Finding]:
+def _rates(match: _Match, off_deg: float, named: bool) -> list[Finding]:
     findings = []
-    if not 0.8 < match.ratio < 1.25:
+    if not named and not 0.8 < match.ratio < 1.25:
         degrees = 0.8 < np.radians(match.ratio) < 1.25
         found = f"readings {match.ratio:.4g} times as large" + (": they are in degrees/s" if degrees else "")
         fix = "convert the gyroscope to rad/s" if degrees else "check the unit of the gyroscope"
@@ -109,26 +112,10 @@ def _rates(match: _Match, off_deg: float) -> list[Finding]:
         R = np.round(match.R_body_imu, 3).tolist()
         fix = f"the rotation body from IMU is about {R}"
         findings.append(Finding("warning", "IMU rotation", found, f"at most {_OFF_DEG:g} deg", fix))
-    if not findings:
+    if not findings and not named:
         found = f"gyroscope in rad/s, {1e3 * match.offset_s:.1f} ms and {off_deg:.1f} deg off the poses"
         findings.append(Finding("ok", "gyroscope", found))
     return findings
-
-
-def _force_unit(imu: Imu) -> Finding:
-    """The accelerometer's magnitude is gravity's most of the time."""
-    norm = float(np.median(np.linalg.norm(np.asarray(imu.acceleration_body), axis=1)))
-    fits = [unit for unit, factor in _UNITS.items() if abs(norm / (_STANDARD * factor) - 1) < 0.15]
-    if "m/s^2" in fits:
-        return Finding("ok", "accelerometer unit", f"{norm:.4g} m/s^2 at the median, gravity's")
-    expected = f"about {_STANDARD:.2f} m/s^2 at the median"
-    found = f"{norm:.4g}" + (f": readings in {fits[0]}" if fits else "")
-    fix = (
-        f"multiply by {1 / _UNITS[fits[0]]:.6g}"
-        if fits
-        else "check its unit, and whether gravity was removed"
-    )
-    return Finding("warning", "accelerometer unit", found, expected, fix)
 
 
 def _gravity(imu: Imu, t: Float[np.ndarray, " n"], T_world_imu: Float[np.ndarray, "n 4 4"]) -> Finding:
@@ -146,9 +133,9 @@ def _gravity(imu: Imu, t: Float[np.ndarray, " n"], T_world_imu: Float[np.ndarray
     if off > _OFF_DEG:
         fix = "turn the world upright, or check that IMU and poses have the same body"
         return Finding("warning", test, f"{told}, {off:.1f} deg off", expected, fix)
-    if abs(np.linalg.norm(up) - _STANDARD) > _MOST_BIAS:
+    if abs(np.linalg.norm(up) - STANDARD) > _MOST_BIAS:
         fix = "calibrate the accelerometer: it has a bias along the vertical, or a wrong scale"
-        return Finding("warning", test, told, f"{_STANDARD:.2f} m/s^2 within {_MOST_BIAS:g}", fix)
+        return Finding("warning", test, told, f"{STANDARD:.2f} m/s^2 within {_MOST_BIAS:g}", fix)
     return Finding("ok", test, f"{told}, {off:.1f} deg off z")
 
 

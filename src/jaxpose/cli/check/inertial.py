@@ -1,28 +1,26 @@
-"""Checks of the EuRoC layout's IMU and ground truth, which need no images."""
+"""Checks of the EuRoC layout's IMU and ground truth, which need no images, and of a file of readings."""
 
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxpose.cli.check.findings import Checked, Fact, Finding, join, unusable
 from jaxpose.cli.check.imu import check_imu
-from jaxpose.cli.check.poses import Quaternions, check_poses
-from jaxpose.cli.check.timestamps import check_stamps
+from jaxpose.cli.check.readings import check_readings
+from jaxpose.cli.check.timestamps import check_stamps, stamps_of
+from jaxpose.cli.check.trajectory import check_read
 from jaxpose.datasets.images import found
 from jaxpose.datasets.rgbd import euroc
-from jaxpose.datasets.rgbd.euroc_files import sensors
+from jaxpose.datasets.rgbd.euroc_files import existing, read_camera_sheet, sensors
+from jaxpose.datasets.rgbd.imu_csv import ImuFile, read_imu, read_mounting
 from jaxpose.errors import DataError
-from jaxpose.files import trajectories
-from jaxpose.files.tables import read_unchecked
+from jaxpose.files.trajectories import TrajectoryFile, read_trajectory, since
+from jaxpose.geometry import rigid
+from jaxpose.imu import Imu
 
 _TRUTHS = ("state_groundtruth_estimate0", "mocap0")  # of EuRoC, of TUM-VI
-_FILES: dict[str, Literal["note", "warning"]] = {
-    "imu0": "warning",
-    "cam0": "warning",
-    **dict.fromkeys(_TRUTHS, "note"),
-}
+_NO_TRUTH = f"no {' or '.join(_TRUTHS)}: there is no ground truth to compare with"
 
 
 def has_depth(path: Path) -> bool:
@@ -35,26 +33,19 @@ def has_depth(path: Path) -> bool:
 def check_inertial(path: Path) -> Checked:
     """Timestamps, readings and ground truth, by themselves and against each other."""
     mav0, parts = sensors(path), []
-    for name, gaps in _FILES.items():
-        file = mav0 / name / "data.csv"
-        if file.is_file() and (table := read_unchecked(file)).size:
-            parts.append(check_stamps(name, table[:, 0] * 1e-9, "ns", gaps=gaps))
-    log = None
+    if (mav0 / "cam0" / "data.csv").is_file():
+        stamps = stamps_of(mav0 / "cam0" / "data.csv", gaps="warning")
+        parts.append(stamps._replace(facts=tuple(fact._replace(name="cam0") for fact in stamps.facts)))
     try:
+        file = next((f for name in _TRUTHS if (f := mav0 / name / "data.csv").is_file()), None)
+        truth = None if file is None else read_trajectory(file)
         if (mav0 / "imu0").is_dir():
+            readings = read_imu(existing(mav0 / "imu0" / "data.csv"))
             log = euroc.load_imu(path)
-            parts.append(_readings(log))
+            parts.append(check_file(readings, "imu0", truth, log.T_body_imu[:3, :3], _cam0(mav0)))
         else:
             parts.append(Checked(notes=("no imu0: poses are not tested against readings",)))
-        file = next((f for name in _TRUTHS if (f := mav0 / name / "data.csv").is_file()), None)
-        if file is not None and log is not None:
-            trajectory = trajectories.read_euroc(file, first_of_repeated=True)
-            t, T = trajectory.t - 1e-9 * log.t0_ns, trajectory.T
-            parts += [_truth(file, log, t, T), check_imu(log.imu, t, T, log.T_body_imu[:3, :3])]
-        elif file is None:
-            parts.append(
-                Checked(notes=(f"no {' or '.join(_TRUTHS)}: there is no ground truth to compare with",))
-            )
+        parts.append(Checked(notes=(_NO_TRUTH,)) if truth is None else check_read(truth, "ground_truth"))
     except (DataError, OSError) as error:
         parts.append(unusable(error))
     if not any(part.facts or part.findings for part in parts):
@@ -62,28 +53,71 @@ def check_inertial(path: Path) -> Checked:
     return join(parts)
 
 
-def _readings(log: euroc.ImuLog) -> Checked:
-    rates, forces = (np.asarray(x) for x in (log.imu.omega_body, log.imu.acceleration_body))
-    rate, force = (float(np.median(np.linalg.norm(x, axis=1))) for x in (rates, forces))
-    text = f"median {rate:.3g} rad/s and {force:.4g} m/s^2, as the units of the format are"
-    return Checked((Fact("readings", text, {"omega": rate, "acceleration": force}),))
+def check_beside(file: Path, mounting: Path | None, truth: TrajectoryFile | None) -> Checked:
+    """A file of readings, tested by itself and against poses of a camera, or of the body, on its clock."""
+    try:
+        T_body_cam = None if mounting is None else read_mounting(mounting).T_body_cam
+        if truth is not None and T_body_cam is not None:
+            T = truth.trajectory.T @ rigid.inverse(T_body_cam)
+            truth = truth._replace(trajectory=truth.trajectory._replace(T=T))
+        R = None if T_body_cam is None else np.eye(3)
+        return check_file(read_imu(file), file.name, truth, R, T_body_cam)
+    except (DataError, OSError) as error:
+        return unusable(error)
 
 
-def _truth(
-    file: Path, log: euroc.ImuLog, t: Float[np.ndarray, " n"], T: Float[np.ndarray, "n 4 4"]
+def check_file(
+    readings: ImuFile,
+    name: str,
+    truth: TrajectoryFile | None,
+    R_body_imu: Float[np.ndarray, "3 3"] | None,
+    T_body_cam: Float[np.ndarray, "4 4"] | None,
 ) -> Checked:
-    """How much of the readings has ground truth, and ground truth by itself.
+    """Readings by themselves, and against poses of their body on their clock.
 
-    `t` is by the clock of the readings.
+    `R_body_imu` and `T_body_cam` are None where nothing states them.
     """
-    end = float(np.asarray(log.imu.t)[-1])
+    imu = readings.since(readings.ns[0])
+    gaps = [Checked(notes=readings.notes)]
+    if readings.gaps:
+        text = f"{readings.gaps} of {readings.gaps + len(readings.ns)} lines that are left out"
+        gaps.append(Checked((), (Finding("warning", "missing readings", text, "a reading in every line"),)))
+    stamps = check_stamps(name, np.asarray(imu.t), readings.unit, gaps="warning", t0_ns=readings.ns[0])
+    R_cam_imu = (
+        None
+        if T_body_cam is None
+        else T_body_cam[:3, :3].T @ (np.eye(3) if R_body_imu is None else R_body_imu)
+    )
+    alone = check_readings(imu, R_cam_imu)
+    parts = [stamps, *gaps, alone.checked]
+    if truth is not None:
+        if not truth.has_timestamps:
+            return join(
+                [*parts, Checked(notes=("poses without timestamps are not tested against readings",))]
+            )
+        t = since(truth.trajectory, readings.ns[0])
+        parts.append(_coverage(imu, t))
+        if not alone.swapped:
+            order = truth.order or "xyzw"
+            parts.append(check_imu(alone.si, t, truth.trajectory.T, R_body_imu, order, alone.gyroscope_named))
+    return join(parts)
+
+
+def _cam0(mav0: Path) -> Float[np.ndarray, "4 4"] | None:
+    """Where cam0 is on the body, if its data sheet can be read."""
+    try:
+        return read_camera_sheet(mav0 / "cam0" / "sensor.yaml")[1]
+    except (DataError, OSError):
+        return None
+
+
+def _coverage(imu: Imu, t: Float[np.ndarray, " n"]) -> Checked:
+    """How much of the readings has ground truth, whose timestamps `t` are by the clock of the readings."""
+    end = float(np.asarray(imu.t)[-1])
     shared = max(0.0, min(end, t[-1]) - max(0.0, t[0]))
     text = f"from {t[0]:.3f} to {t[-1]:.3f} s, IMU from 0 to {end:.3f} s"
-    fact = Fact("ground_truth", text, {"first_s": float(t[0]), "coverage": shared / end if end else 0.0})
-    findings = ()
-    if shared <= 0:
-        fix = "check that both are of one recording, by one clock"
-        findings = (Finding("warning", "ground_truth", text, "ground truth while the IMU reads", fix),)
-    table = read_unchecked(file)
-    values = table[np.append(True, np.diff(table[:, 0]) != 0), 4:8]
-    return join([Checked((fact,), findings), check_poses(t, T, Quaternions(values, "wxyz"))])
+    fact = Fact("overlap", text, {"first_s": float(t[0]), "coverage": shared / end if end else 0.0})
+    if shared > 0:
+        return Checked((fact,))
+    fix = "check that both are of one recording, by one clock"
+    return Checked((fact,), (Finding("warning", "overlap", text, "poses while the IMU reads", fix),))

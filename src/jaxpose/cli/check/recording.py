@@ -13,11 +13,10 @@ from jaxpose.cli.check.findings import Checked, Fact, Finding, join, unusable
 from jaxpose.cli.check.inertial import check_inertial
 from jaxpose.cli.check.poses import check_poses
 from jaxpose.cli.check.reprojection import check_reprojection
-from jaxpose.cli.check.timestamps import check_stamps
+from jaxpose.cli.check.timestamps import stamps_of
 from jaxpose.datasets.rgbd import registry as rgbd_registry
 from jaxpose.datasets.types import Recording
 from jaxpose.errors import DataError
-from jaxpose.files.tables import read_unchecked
 from jaxpose.geometry.camera import Camera, angle_of_view
 
 _STAMPS = {"tum": ("rgb.txt", "depth.txt", "groundtruth.txt"), "plain": ("times.txt",)}
@@ -32,9 +31,8 @@ def check_recording(path: Path, form: rgbd_registry.Format, topics: Sequence[str
     """Everything that is tested of a recording in the format `form`, images looked at here and there only."""
     parts = []
     for name in _STAMPS.get(form, ()):
-        if (path / name).is_file() and (table := read_unchecked(path / name)).size:
-            ground_truth = name == "groundtruth.txt"
-            parts.append(check_stamps(name, table[:, 0], gaps="note" if ground_truth else "warning"))
+        if (path / name).is_file():
+            parts.append(stamps_of(path / name, gaps="note" if name == "groundtruth.txt" else "warning"))
     if form == "euroc":
         parts.append(check_inertial(path))
     try:

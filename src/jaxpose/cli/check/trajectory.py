@@ -2,45 +2,46 @@
 
 from pathlib import Path
 
-import numpy as np
-
-from jaxpose.cli.check.findings import Checked, Fact, join, unusable
+from jaxpose.cli.check.findings import Checked, Fact, Finding, join, unusable
 from jaxpose.cli.check.poses import Quaternions, check_poses
 from jaxpose.cli.check.timestamps import check_stamps
 from jaxpose.datasets.images import some
 from jaxpose.errors import DataError
-from jaxpose.files import trajectories
-from jaxpose.files.tables import read_unchecked
+from jaxpose.files.trajectories import TrajectoryFile, read_trajectory
 
 _SUFFIXES = (".txt", ".csv", ".tum", ".kitti")
+_NONE = ": expected a trajectory, "  # in what the reader says of a file that is none
 
 
-def check_trajectory(file: Path) -> tuple[str, Checked]:
-    """The format of a file of poses, and what is tested of it; DataError for what is no trajectory at all."""
-    table = read_unchecked(file)
-    form, stamped, parts = "", False, []
-    if table.size and table.shape[1] in (8, 17):
-        commas = any("," in line for line in _head(file))
-        form, stamped, unit = ("EuRoC", True, "ns") if commas else ("TUM", True, "s")
-        parts.append(check_stamps("poses", table[:, 0] * (1e-9 if commas else 1.0), unit, gaps="note"))
+def check_trajectory(file: Path, columns: str | None = None) -> tuple[str, Checked]:
+    """The format of a file of poses, and what is tested of it; DataError for what is no trajectory at all.
+
+    `columns` are as `read_trajectory` has them.
+    """
     try:
-        found = trajectories.read_trajectory(file)
+        found = read_trajectory(file, columns)
     except DataError as error:
-        if not form:
+        if _NONE in str(error):
             raise
-        return form, join([*parts, unusable(error)])
-    t, T = found.trajectory
+        return "unreadable", unusable(error)
+    return found.format, check_read(found)
+
+
+def check_read(found: TrajectoryFile, what: str = "poses") -> Checked:
+    """What is tested of poses as they were read."""
+    t, T, t0_ns = found.trajectory
+    missing = Checked(notes=found.notes)
+    if found.missing:
+        text = f"{found.missing} of {found.count} with NaN, infinity or a zero quaternion, which are left out"
+        finding = Finding("warning", "missing poses", text, f"numbers in every line of {what}")
+        missing = missing._replace(findings=(finding,))
     if not found.has_timestamps:
-        fact = Fact("poses", f"{len(t)}, no timestamps", {"count": len(t)})
-        return found.format, join([Checked((fact,)), check_poses(None, T)])
-    order = "wxyz" if found.format == "EuRoC" else "xyzw"
-    # Of poses with the same timestamp the reader keeps the first.
-    kept = np.append(True, np.diff(table[:, 0]) != 0)
-    notes = ()
-    if found.repeated:
-        notes = (f"{found.repeated} poses left out, as they repeat the timestamp before them",)
-    poses = check_poses(t, T, Quaternions(table[kept][: len(T), 4:8], order))
-    return found.format, join([*parts, poses, Checked(notes=notes)])
+        fact = Fact(what, f"{len(t)}, no timestamps", {"count": len(t)})
+        return join([Checked((fact,)), missing, check_poses(None, T)])
+    assert found.unit is not None and found.order is not None and found.quaternion_xyzw is not None
+    stamps = check_stamps(what, t, found.unit, gaps="note", t0_ns=t0_ns, repeated=found.repeated)
+    written = found.quaternion_xyzw if found.order == "xyzw" else found.quaternion_xyzw[:, [3, 0, 1, 2]]
+    return join([stamps, missing, check_poses(t, T, Quaternions(written, found.order))])
 
 
 def check_trajectories(folder: Path) -> Checked | None:
@@ -69,8 +70,3 @@ def check_trajectories(folder: Path) -> Checked | None:
         return None
     note = (f"not looked at, as it is no trajectory: {some(others)}",) if others else ()
     return join([*parts, Checked(notes=note)])
-
-
-def _head(file: Path) -> list[str]:
-    lines = file.read_text("utf-8-sig", "replace").splitlines()
-    return [line for line in lines if line.strip() and not line.lstrip().startswith("#")][:1]

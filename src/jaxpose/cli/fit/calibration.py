@@ -64,7 +64,8 @@ def calibrate(config, source: str, trajectory: Trajectory, on_update: OnUpdate) 
         DataError, OSError: for what cannot be used.
     """
     t0 = float(trajectory.t[0])
-    imu, sheet = _readings(config.imu, t0)
+    t0_ns = trajectory.t0_ns + round(t0 * 1e9)
+    imu, sheet, notes = _readings(config.imu, t0_ns)
     sigmas = np.repeat([config.position_sigma, np.radians(config.rotation_sigma_deg)], 3)
     mounting = None if config.extrinsics is None else read_mounting(config.extrinsics)
     on_update(Update(f"estimating {', '.join(config.estimate)} (compiling)"))
@@ -81,10 +82,9 @@ def calibrate(config, source: str, trajectory: Trajectory, on_update: OnUpdate) 
         )
     except ValueError as error:
         raise DataError(f"{source}: {error}") from None
-    notes = []
     if config.out is not None:
         on_update(Update(f"writing {config.out}"))
-        _write(config.out, known, t0)
+        _write(config.out, known, t0_ns / 10**9)
         upright = ", world upright" if "gravity" in config.estimate else ""
         notes.append(f"trajectory with covariance written to {config.out}, metres{upright}")
     if config.kalibr is not None:
@@ -141,15 +141,15 @@ def calibration_report(found: Calibration) -> str:
     return "\n".join([markdown_table(rows), "", *(f"  {line}" for line in lines)])
 
 
-def _readings(path: Path, t0: float) -> tuple[Imu, ImuNoise | None]:
-    """Readings with seconds since the first pose, and their data sheet where there is one."""
+def _readings(path: Path, t0_ns: int) -> tuple[Imu, ImuNoise | None, list[str]]:
+    """Readings with seconds since the first pose, their data sheet where there is one, and notes on them."""
     if path.is_dir():
-        log = euroc.load_imu(path)
-        t = np.asarray(log.imu.t, np.float64) + (log.t0_ns * 1e-9 - t0)
-        return Imu(t, np.asarray(log.imu.omega_body), np.asarray(log.imu.acceleration_body)), log.noise
+        log = euroc.load_imu(path, t0_ns)
+        return log.imu, log.noise, list(log.notes)
     if not path.exists():
         raise DataError(f"{path}: expected readings of an IMU, a file or a folder, got nothing")
-    return read_imu(path, round(t0 * 1e9)), None
+    file = read_imu(path)
+    return file.since(t0_ns), None, list(file.notes)
 
 
 def _write(out: Path, known: Posterior, t0: float) -> None:

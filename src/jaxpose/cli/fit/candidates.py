@@ -117,27 +117,28 @@ def fit_field(
         trajectory_error.statistics(angle),
         None if imu is None else _inertial(field, params, around, imu),
     )
-    return fitted, fields.shifted(field, around.t0), params
+    return fitted, fields.shifted(field, around.t0 + trajectory.t0_ns / 10**9), params
 
 
 def readings(folder: Path, trajectory: Trajectory) -> tuple[Imu, Sensor, tuple[str, ...]]:
     """The readings within the trajectory's span, on its clock."""
-    log = euroc.load_imu(folder)
-    t = log.t0_ns * 1e-9 + np.asarray(log.imu.t, np.float64)
+    log = euroc.load_imu(folder, trajectory.t0_ns)
+    t = np.asarray(log.imu.t, np.float64)
     first, last = trajectory.t[[0, -1]]
     within = (t >= first) & (t <= last)
     if within.sum() < FEWEST:
+        t0 = trajectory.t0_ns / 10**9
         raise DataError(
-            f"{folder}: expected an IMU on the clock of the poses, {first:.3f} to {last:.3f} s, got "
-            f"{t[0]:.3f} to {t[-1]:.3f} s"
+            f"{folder}: expected an IMU on the clock of the poses, {t0 + first:.3f} to {t0 + last:.3f} s, "
+            f"got {t0 + t[0]:.3f} to {t0 + t[-1]:.3f} s"
         )
     omega, force = (np.asarray(x)[within] for x in (log.imu.omega_body, log.imu.acceleration_body))
     rate_hz = 1 / float(np.median(np.diff(np.asarray(log.imu.t))))
     measured = (sample_noise(omega), sample_noise(force))
     sensor = Sensor(int(within.sum()), rate_hz, noise_floor(log.noise, rate_hz), measured)
-    notes = ()
+    notes = log.notes
     if not within.all():
-        notes = (f"{int((~within).sum())} of {len(t)} inertial readings lie outside of the poses: not used",)
+        notes += (f"{int((~within).sum())} of {len(t)} inertial readings lie outside of the poses: not used",)
     return Imu(t[within], omega, force), sensor, notes
 
 

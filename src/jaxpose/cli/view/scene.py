@@ -12,6 +12,7 @@ from jaxpose.errors import DataError
 from jaxpose.evaluation import trajectory_error
 from jaxpose.experiments.progress import OnUpdate, Update, silent
 from jaxpose.files import trajectories
+from jaxpose.files.association import associate, nearest
 
 if TYPE_CHECKING:
     from jaxpose.geometry.camera import Camera
@@ -68,12 +69,12 @@ def up_direction(T_world_cam: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "
 
 def _poses(source: Source) -> tuple[Poses, tuple[str, ...]]:
     """The camera's poses at times since the first frame; those of the nearest frames where no field is."""
-    t, T = source.trajectory
+    t, T = source.trajectory[:2]
     if source.is_run and (source.path / FIELD).is_file():
         field = read_field(source)
         return lambda s: field(t[0] + s), ()
     note = f"no {FIELD}: between its frames the camera's motion is not known, it stands at the nearest"
-    return lambda s: T[trajectories.nearest(t[0] + s, t)], (note,)
+    return lambda s: T[nearest(t[0] + s, t)], (note,)
 
 
 def _camera(source: Source) -> tuple["Camera", tuple[Path, ...], tuple[str, ...]]:
@@ -103,9 +104,10 @@ def _reference(source: Source) -> tuple[Float[np.ndarray, "k 3"] | None, tuple[s
     if not (source.is_run and file.is_file()):
         return None, ()
     estimate, ground_truth = source.trajectory, trajectories.read_tum(file)
+    ground_truth = ground_truth._replace(t=trajectories.since(ground_truth, 0))
     if ground_truth.t[0] <= estimate.t[0] + 1e-6:
         return ground_truth.T[:, :3, 3], ()
-    ours, theirs = trajectories.associate(estimate.t, ground_truth.t, 1e-3)
+    ours, theirs = associate(estimate.t, ground_truth.t, 1e-3)
     fit = trajectory_error.ate(ground_truth.T[theirs], estimate.T[ours], "se3").alignment
     note = (
         "the ground truth begins later than the run, in a world of its own: moved onto the estimate by SE(3)"
@@ -146,7 +148,7 @@ def _shots(
     source: Source, most: int, images: tuple[Path, ...], render: Render | None, on_update: OnUpdate
 ) -> tuple[tuple[Shot, ...], tuple[str, ...]]:
     """Some of the frames, evenly, the first and the last among them."""
-    t, T = source.trajectory
+    t, T = source.trajectory[:2]
     rows = np.unique(np.linspace(0, len(t) - 1, min(most, len(t))).round().astype(int)) if most else []
     shots = []
     for number, row in enumerate(rows):

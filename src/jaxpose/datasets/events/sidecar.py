@@ -14,7 +14,7 @@ from jaxpose.errors import DataError
 from jaxpose.events import Mosaic
 from jaxpose.files.camera_json import read_camera
 from jaxpose.files.tables import read_numbers
-from jaxpose.files.trajectories import Trajectory, read_trajectory
+from jaxpose.files.trajectories import Trajectory, read_trajectory, since
 from jaxpose.geometry.camera import Camera
 
 # Width and height of event cameras: DVS128, DAVIS240, ATIS, DAVIS346, VGA (Prophesee, DSEC), 720p.
@@ -126,13 +126,11 @@ def _read_truth(file: Path, zero_s: float, span: tuple[float, float]) -> tuple[T
     if not file.is_file():
         none = Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
         return none, (f"no {file.name}: there is no ground truth to compare with",)
-    ground_truth, form, stamped, repeated = read_trajectory(file)
-    if not stamped:
-        raise DataError(f"{file}: expected poses with timestamps (TUM or EuRoC), got a {form} file")
-    t = ground_truth.t - zero_s
-    notes = []
-    if repeated:
-        notes.append(f"{repeated} lines of {file.name} repeat the timestamp before them and are ignored")
+    found = read_trajectory(file)
+    if not found.has_timestamps:
+        raise DataError(f"{file}: expected poses with timestamps (TUM or EuRoC), got a {found.format} file")
+    ground_truth, notes = found.trajectory, list(found.notes)
+    t = since(ground_truth, round(zero_s * 1e9))
     if t[-1] < span[0] or t[0] > span[1]:
         notes.append(
             f"no true pose in the time of the events, {span[0]:.4g} to {span[1]:.4g} s: those of {file.name} "

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxpose.errors import DataError
-from jaxpose.files.trajectories import orthonormal
+from jaxpose.files.matrices import orthonormal
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # right, up, back to right, down, forward, and the other way
 _HELD_OUT = 8

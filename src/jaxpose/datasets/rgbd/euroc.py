@@ -25,16 +25,18 @@ from jaxpose.datasets.images import (
 from jaxpose.datasets.rgbd.cloud_depth import depth_from_cloud
 from jaxpose.datasets.rgbd.euroc_files import (
     IMU_COLUMNS,
+    existing,
     read_camera_sheet,
     read_csv,
     read_imu_sheet,
     read_listing,
     sensors,
 )
+from jaxpose.datasets.rgbd.imu_csv import read_imu
 from jaxpose.datasets.types import Frame, Recording
 from jaxpose.errors import DataError
 from jaxpose.files.ply import read_points
-from jaxpose.files.tables import seconds
+from jaxpose.files.tables import left_out_notes, seconds
 from jaxpose.files.trajectories import Trajectory
 from jaxpose.geometry import rigid
 from jaxpose.geometry.camera import Camera
@@ -52,6 +54,7 @@ class ImuLog(NamedTuple):
     noise: ImuNoise
     t0_ns: int  # since 1970
     T_body_imu: Float[np.ndarray, "4 4"]
+    notes: tuple[str, ...] = ()  # what of the readings was left out, with counts
 
 
 class GroundTruth(NamedTuple):
@@ -62,6 +65,7 @@ class GroundTruth(NamedTuple):
     velocity_world: Float[np.ndarray, "n 3"]
     gyro_bias: Float[np.ndarray, "n 3"]
     accelerometer_bias: Float[np.ndarray, "n 3"]
+    notes: tuple[str, ...] = ()  # what was left out, with counts
 
 
 class CameraLog(NamedTuple):
@@ -116,7 +120,7 @@ def load(path: Path | str) -> Recording:
     """
     mav0 = sensors(path)
     cam0 = load_camera(mav0)
-    T_world_body, untrue = _truth_at(mav0, cam0.stamps_ns)
+    T_world_body, untrue, gaps = _truth_at(mav0, cam0.stamps_ns)
     T_world_cam = T_world_body @ cam0.T_body_cam
     depth = _find_depth(mav0, cam0, T_world_cam)
     rows = depth.rows
@@ -138,7 +142,7 @@ def load(path: Path | str) -> Recording:
         T_world_cam=poses,
         imu=log.imu,
         T_body_cam=rigid.inverse(log.T_body_imu) @ cam0.T_body_cam,
-        notes=(*depth.notes, *lacking, *_unused(mav0)),
+        notes=(*depth.notes, *lacking, *gaps, *log.notes, *_unused(mav0)),
         t0_ns=t0_ns,
         files=within([cam0.files[row] for row in rows], path),
     )
@@ -183,11 +187,10 @@ def load_imu(path: Path | str, t0_ns: int | None = None) -> ImuLog:
         DataError: For files that cannot be used.
     """
     folder = sensors(path) / "imu0"
-    table = read_csv(folder / "data.csv", IMU_COLUMNS)
+    file = read_imu(existing(folder / "data.csv"))
     noise, T_body_imu = read_imu_sheet(folder / "sensor.yaml")
-    t0_ns = table.ns[0] if t0_ns is None else t0_ns
-    imu = Imu(seconds(table.ns, t0_ns), table.values[:, :3], table.values[:, 3:])
-    return ImuLog(imu, noise, t0_ns, T_body_imu)
+    t0_ns = file.ns[0] if t0_ns is None else t0_ns
+    return ImuLog(file.since(t0_ns), noise, t0_ns, T_body_imu, file.notes)
 
 
 def load_truth(path: Path | str, t0_ns: int | None = None) -> GroundTruth:
@@ -205,7 +208,8 @@ def load_truth(path: Path | str, t0_ns: int | None = None) -> GroundTruth:
         DataError: For files that cannot be used.
     """
     file = sensors(path) / "state_groundtruth_estimate0" / "data.csv"
-    lines, timestamps, values = read_csv(file, _TRUTH_COLUMNS)
+    table = read_csv(file, _TRUTH_COLUMNS)
+    lines, timestamps, values = table.lines, table.ns, table.values
     if t0_ns is None:
         t0_ns = read_csv(sensors(path) / "imu0" / "data.csv", IMU_COLUMNS, rows=1).ns[0]
     norm = np.linalg.norm(values[:, 3:7], axis=1)
@@ -214,7 +218,12 @@ def load_truth(path: Path | str, t0_ns: int | None = None) -> GroundTruth:
         raise DataError(f"{file}:{lines[row]}: expected a unit quaternion, got norm {norm[row]:.4g}")
     T_world_body = rigid.make(Rotation.from_quat(values[:, [4, 5, 6, 3]]).as_matrix(), values[:, :3])
     return GroundTruth(
-        seconds(timestamps, t0_ns), T_world_body, values[:, 7:10], values[:, 10:13], values[:, 13:16]
+        seconds(timestamps, t0_ns),
+        T_world_body,
+        values[:, 7:10],
+        values[:, 10:13],
+        values[:, 13:16],
+        left_out_notes(file, table),
     )
 
 
@@ -238,15 +247,17 @@ def common_start(path: Path | str) -> tuple[int, float]:
     return t0_ns, (t0_ns - imu) * 1e-9
 
 
-def _truth_at(mav0: Path, stamps_ns: list[int]) -> tuple[Float[np.ndarray, "n 4 4"], tuple[str, ...]]:
-    """T_world_body at timestamps, NaN where ground truth has a gap; a note if there is none."""
+def _truth_at(
+    mav0: Path, stamps_ns: list[int]
+) -> tuple[Float[np.ndarray, "n 4 4"], tuple[str, ...], tuple[str, ...]]:
+    """T_world_body at timestamps, NaN where ground truth has a gap; notes: there is none; on its lines."""
     if not (mav0 / "state_groundtruth_estimate0").is_dir():
         none = np.full((len(stamps_ns), 4, 4), np.nan)
-        return none, ("no state_groundtruth_estimate0: there is no ground truth to compare with",)
+        return none, ("no state_groundtruth_estimate0: there is no ground truth to compare with",), ()
     t0_ns = stamps_ns[0]
     ground_truth = load_truth(mav0, t0_ns)
     trajectory = Trajectory(ground_truth.t, ground_truth.T_world_body)
-    return poses_at(trajectory, seconds(stamps_ns, t0_ns)), ()
+    return poses_at(trajectory, seconds(stamps_ns, t0_ns)), (), ground_truth.notes
 
 
 def _find_depth(mav0: Path, cam0: CameraLog, T_world_cam: Float[np.ndarray, "n 4 4"]) -> _Depth:

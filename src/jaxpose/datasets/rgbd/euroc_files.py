@@ -27,7 +27,7 @@ def sensors(path: Path | str) -> Path:
     return path / "mav0" if (path / "mav0").is_dir() else path
 
 
-def _existing(file: Path) -> Path:
+def existing(file: Path) -> Path:
     if not file.is_file():
         raise DataError(f"{file}: expected a file, got none")
     return file
@@ -36,12 +36,12 @@ def _existing(file: Path) -> Path:
 def read_csv(file: Path, columns: str, rows: int | None = None) -> StampedRows:
     """Timestamps, other columns and line numbers of the first `rows` rows; errors name `columns`."""
     count = int(columns.split()[0])
-    return read_stamped(_existing(file), columns, count, unit="ns", separator=",", rows=rows)
+    return read_stamped(existing(file), columns, count, unit="ns", separator=",", rows=rows)
 
 
 def read_listing(folder: Path) -> tuple[list[int], list[Path]]:
     """Timestamps [ns] and image files of `data.csv`, lines of timestamp and file name."""
-    timestamps, names = read_stamped_names(_existing(folder / "data.csv"), unit="ns", separator=",")
+    timestamps, names = read_stamped_names(existing(folder / "data.csv"), unit="ns", separator=",")
     return timestamps, [folder / "data" / name for name in names]
 
 
@@ -80,7 +80,7 @@ def read_extrinsics(file: Path) -> Float[np.ndarray, "4 4"]:
 
 
 def _sheet(file: Path) -> dict[str, Any]:
-    return read_yaml(_existing(file), "a data sheet")
+    return read_yaml(existing(file), "a data sheet")
 
 
 def _extrinsics(file: Path, content: dict[str, Any]) -> Float[np.ndarray, "4 4"]:

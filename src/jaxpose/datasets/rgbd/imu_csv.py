@@ -1,44 +1,119 @@
 """A real IMU's raw readings in a file of their own, for a recording whose layout has none."""
 
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
-from jaxpose.datasets.rgbd.euroc_files import IMU_COLUMNS, read_csv, read_extrinsics
+from jaxpose.datasets.rgbd.euroc_files import read_extrinsics
 from jaxpose.datasets.types import Recording
 from jaxpose.errors import DataError
+from jaxpose.files.columns import POSE, Named, joined_clock, named_columns
 from jaxpose.files.kalibr import CameraImu, is_camchain, read_camchain
-from jaxpose.files.tables import numbered_lines, read_all_numbers, read_stamped, seconds
-from jaxpose.files.trajectories import orthonormal
+from jaxpose.files.matrices import orthonormal
+from jaxpose.files.tables import (
+    left_out_notes,
+    numbered_lines,
+    read_all_numbers,
+    read_table,
+    seconds,
+    stamped_rows,
+)
+from jaxpose.files.timestamps import READINGS, Unit
 from jaxpose.geometry import rigid
 from jaxpose.imu import Imu
 from jaxpose.imu.gravity import gravity_note
 
-_TEXT_COLUMNS = "7 numbers (t wx wy wz ax ay az)"
+_COLUMNS = "7 columns (t wx wy wz ax ay az)"
+_RATE = r"(w|omega|g|gyro?|gyroscope|angular_velocity|ang_?vel|rotation_?rate|w_rs_s|alpha)"
+_FORCE = r"(a|acc|accel|accelerometer|acceleration|linear_acceleration|lin_?acc|f|force|a_rs_s)"
+_NAMES = {
+    "t": POSE["t"],
+    **{f"w{axis}": rf"{_RATE}_?{axis}" for axis in "xyz"},
+    **{f"a{axis}": rf"{_FORCE}_?{axis}" for axis in "xyz"},
+}
+_ORDER = tuple(_NAMES)
+_DEGREE, _STANDARD = np.pi / 180, 9.80665
+_TO_SI = {
+    **dict.fromkeys(("", "rad/s", "rads^-1", "rads-1", "rad/sec", "m/s^2", "ms^-2", "ms-2", "m/s2"), 1.0),
+    **dict.fromkeys(("deg/s", "degs^-1", "degs-1", "dps", "deg/sec"), _DEGREE),
+    "g": _STANDARD,
+    "mg": 1e-3 * _STANDARD,
+}
 
 
-def read_imu(file: Path | str, t0_ns: int = 0) -> Imu:
-    """Read raw readings: with commas lines of EuRoC's `imu0/data.csv`, with blanks `t wx wy wz ax ay az`.
+class ImuFile(NamedTuple):
+    """Readings [rad/s, m/s^2, gravity in them] as a file has them, at whole ns on its own clock."""
+
+    ns: list[int]
+    omega_body: Float[np.ndarray, "n 3"]
+    acceleration_body: Float[np.ndarray, "n 3"]
+    notes: tuple[str, ...]  # what was left out, with counts, and what is unusual
+    unit: Unit  # of its timestamps
+    gaps: int  # lines left out, as they have no numbers or repeat a timestamp
+
+    def since(self, t0_ns: int) -> Imu:
+        """The readings with float64 seconds since `t0_ns`."""
+        return Imu(seconds(self.ns, t0_ns), self.omega_body, self.acceleration_body)
+
+
+def read_imu(file: Path | str) -> ImuFile:
+    """Read raw readings: a table whose header names them, or lines of `t wx wy wz ax ay az`.
+
+    Timestamps are whole ns where lines have commas, as in EuRoC's `imu0/data.csv`, else decimal seconds;
+    another unit is found by their size and steps. A unit in brackets in the header is brought to SI. Lines
+    with NaN, and those that repeat a timestamp, are left out and counted.
 
     Args:
-        file: Its timestamps are whole ns where lines have commas, else decimal seconds.
-        t0_ns: Where time is 0 [ns] on the file's own clock.
+        file: The table.
 
     Returns:
-        Readings [rad/s, m/s^2, gravity in them] with float64 seconds since `t0_ns`.
+        The readings.
 
     Raises:
-        DataError: Naming file and line for anything else, for text or NaN, for timestamps that repeat or go
-            backwards, and for fewer than two readings.
+        DataError: Naming file and line for anything else, for text, for timestamps that go backwards or may
+            be of two units, and for fewer than two readings.
     """
     file = Path(file)
-    if "," in next((line for _, line in numbered_lines(file)), ""):
-        _, ns, values = read_csv(file, IMU_COLUMNS)
-    else:
-        _, ns, values = read_stamped(file, _TEXT_COLUMNS, 7, unit="s")
-    if len(ns) < 2:
-        raise DataError(f"{file}: expected at least 2 readings, got {len(ns)}")
-    return Imu(seconds(ns, t0_ns), values[:, :3], values[:, 3:])
+    table = joined_clock(read_table(file))
+    if not table.lines:
+        raise DataError(f"{file}: expected lines of {_COLUMNS}, got none")
+    named, width = named_columns(table, _NAMES), len(table.words[0])
+    if named is None and width != 7:
+        raise DataError(
+            f"{file}:{table.lines[0]}: expected {_COLUMNS}, or a header that names them, got {width} columns"
+        )
+    at = tuple(range(7)) if named is None else tuple(named.at[name] for name in _ORDER)
+    usual: Unit = "s" if table.separator is None else "ns"
+    stated = None if named is None else named.unit
+    rows = stamped_rows(
+        file, table, _COLUMNS, at, unit=stated or usual, exact=stated is not None, steps=READINGS
+    )
+    if len(rows.ns) < 2:
+        raise DataError(f"{file}: expected at least 2 readings, got {len(rows.ns)}")
+    notes = left_out_notes(file, rows)
+    if rows.unit != (stated or usual):
+        notes += (f"{file.name}: timestamps are in {rows.unit}, by their size and steps",)
+    (rate, force), brought = _to_si(file, named)
+    gaps = len(rows.missing) + len(rows.repeated)
+    return ImuFile(
+        rows.ns, rate * rows.values[:, :3], force * rows.values[:, 3:], notes + brought, rows.unit, gaps
+    )
+
+
+def _to_si(file: Path, named: Named | None) -> tuple[tuple[float, float], tuple[str, ...]]:
+    """What brings rates to rad/s and forces to m/s^2 by the units of the header, and what to say of it."""
+    factors, notes = [], []
+    for name, quantity in (("wx", "the gyroscope"), ("ax", "the accelerometer")):
+        stated = "" if named is None else named.stated[name]
+        factor = _TO_SI.get(stated.lower().replace(" ", "").replace("\u00b0", "deg").replace("*", ""))
+        if factor is None:
+            notes.append(f"{file.name}: unit {stated!r} of {quantity} is not known: taken as SI")
+        elif factor != 1:
+            notes.append(f"{file.name}: {quantity} is in {stated}, by the header: multiplied by {factor:.6g}")
+        factors.append(factor or 1.0)
+    return (factors[0], factors[1]), tuple(notes)
 
 
 def read_mounting(file: Path | str) -> CameraImu:
@@ -80,8 +155,11 @@ def with_imu(recording: Recording, readings: Path | str, mounting: Path | str) -
     Raises:
         DataError: As the two.
     """
-    imu, (T_body_cam, offset_s) = read_imu(readings, recording.t0_ns), read_mounting(mounting)
-    return recording._replace(imu=imu._replace(t=imu.t - offset_s), T_body_cam=T_body_cam)
+    file, (T_body_cam, offset_s) = read_imu(readings), read_mounting(mounting)
+    imu = file.since(recording.t0_ns)
+    return recording._replace(
+        imu=imu._replace(t=imu.t - offset_s), T_body_cam=T_body_cam, notes=(*recording.notes, *file.notes)
+    )
 
 
 def imu_notes(recording: Recording, name: Path | str) -> tuple[str, ...]:

@@ -16,7 +16,8 @@ from jaxpose.datasets.rgbd.frames import Poses, of_files, visible
 from jaxpose.datasets.rgbd.plain_files import LOGS, check_count, read_camera, read_poses
 from jaxpose.datasets.types import Recording
 from jaxpose.errors import DataError
-from jaxpose.files.tables import numbered_lines, read_stamped
+from jaxpose.files.tables import numbered_lines
+from jaxpose.files.trajectories import read_timestamps
 
 _COLORS = ("color", "rgb", "image", "images")
 
@@ -147,6 +148,6 @@ def _read_times(file: Path, count: int) -> list[int] | None:
     """Increasing timestamps [ns], one for each colour image; None without a file."""
     if not file.is_file():
         return None
-    ns = read_stamped(file, "1 number (a timestamp in seconds)", 1, unit="s").ns
+    ns = read_timestamps(file)
     check_count(file, len(ns), count)
     return ns

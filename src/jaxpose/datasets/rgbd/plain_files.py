@@ -8,9 +8,11 @@ from jaxtyping import Float
 
 from jaxpose.datasets.images import INTRINSICS, Pinhole, check_intrinsics, read_intrinsics, sidecar
 from jaxpose.errors import DataError
+from jaxpose.files.association import nearest
 from jaxpose.files.schema import numbers
-from jaxpose.files.tables import numbered_lines, read_numbers
-from jaxpose.files.trajectories import nearest, read_kitti, read_tum
+from jaxpose.files.tables import numbered_lines, read_numbers, seconds
+from jaxpose.files.timestamps import whole_ns
+from jaxpose.files.trajectories import read_kitti, read_trajectory
 from jaxpose.files.untrusted import read_json
 
 JSON = ("intrinsics.json", "camera_intrinsic.json", "intrinsic.json")
@@ -59,11 +61,11 @@ def read_poses(file: Path, ns: list[int] | None, count: int) -> tuple[list[int] 
         return None, _read_log(file, count)
     columns = _columns(file)
     if columns == 8:
-        trajectory = read_tum(file, first_of_repeated=ns is not None)
+        trajectory = read_trajectory(file).trajectory
         if ns is None:
             check_count(file, len(trajectory.t), count)
-            return [round(s * 1e9) for s in trajectory.t.tolist()], trajectory.T
-        t = np.array(ns, np.float64) / 1e9
+            return whole_ns(trajectory.t, trajectory.t0_ns), trajectory.T
+        t = seconds(ns, trajectory.t0_ns)
         row = nearest(t, trajectory.t)
         near = np.abs(trajectory.t[row] - t) <= _MOST_APART_S
         return None, np.where(near[:, None, None], trajectory.T[row], np.nan)

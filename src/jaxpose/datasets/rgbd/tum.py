@@ -21,8 +21,9 @@ from jaxpose.datasets.rgbd.frames import Poses, listed, of_files
 from jaxpose.datasets.rgbd.pairs import nearest_pairs, unpaired_note
 from jaxpose.datasets.types import Accelerometer, Recording
 from jaxpose.errors import DataError
+from jaxpose.files.association import nearest
 from jaxpose.files.tables import numbered_lines, read_all_numbers, read_numbers, read_stamped_names
-from jaxpose.files.trajectories import nearest, read_trajectory
+from jaxpose.files.trajectories import read_trajectory, since
 from jaxpose.geometry import rigid
 from jaxpose.geometry.camera import Camera
 from jaxpose.imu import GRAVITY_WORLD
@@ -195,16 +196,14 @@ def _truth(file: Path, timestamps: Float[np.ndarray, " n"], limit: float) -> tup
     """The true poses nearest in time, and a note on lines that count for nothing."""
     if not file.is_file():
         return Poses(None, str, missing="no groundtruth.txt"), ()
-    ground_truth, form, _, repeated = read_trajectory(file)
-    if form != "TUM":
-        raise DataError(f"{file}: expected lines of t tx ty tz qx qy qz qw, got a {form} file")
-    row = nearest(timestamps, ground_truth.t)
-    near = np.abs(ground_truth.t[row] - timestamps) < limit
-    poses = np.where(near[:, None, None], ground_truth.T[row], np.nan)
-    notes = ()
-    if repeated:
-        notes = (f"{repeated} lines of groundtruth.txt repeat the timestamp before them and are ignored",)
-    return Poses(poses, lambda i: str(file), f"none within {limit:g} s"), notes
+    found = read_trajectory(file)
+    if not found.has_timestamps:
+        raise DataError(f"{file}: expected lines of t tx ty tz qx qy qz qw, got a {found.format} file")
+    at = since(found.trajectory, 0)
+    row = nearest(timestamps, at)
+    near = np.abs(at[row] - timestamps) < limit
+    poses = np.where(near[:, None, None], found.trajectory.T[row], np.nan)
+    return Poses(poses, lambda i: str(file), f"none within {limit:g} s"), found.notes
 
 
 def _accelerometer(
