@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxpose.datasets import images
 from jaxpose.datasets.rgbd import euroc
+from jaxpose.datasets.rgbd.euroc_files import read_camera_sheet
 from jaxpose.errors import DataError
 
 
@@ -210,12 +211,12 @@ SHEET = CAMERA_SHEET.format(pose="1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1
         ),
         ("cam0/data.csv", "5\n", "cam0/data.csv:1: expected a timestamp in ns and a file name"),
         ("cam0/data.csv", "5,a.png\n5,b.png\n", "cam0/data.csv:2: expected a timestamp after 0.000000005 s"),
-        ("cam0/data.csv", "5,a.png\n", "cam0/data/a.png: expected an image, got nothing"),
+        ("cam0/data.csv", "5,a.png\n", "cam0/data.csv: expected the files that it lists, got none of 1"),
         ("cam0/sensor.yaml", None, "cam0/sensor.yaml: expected a file, got none"),
         (
             "cam0/sensor.yaml",
             SHEET.replace("radial-tangential", "equidistant"),
-            "cam0/sensor.yaml: distortion_model: expected one of radial-tangential, got 'equidistant'",
+            "cam0/sensor.yaml: distortion_model: expected one of radial-tangential, .*, got 'equidistant'",
         ),
         (
             "cam0/sensor.yaml",
@@ -228,8 +229,12 @@ SHEET = CAMERA_SHEET.format(pose="1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1
             "yaml: expected the images' res.*, 32x24",
         ),
         ("cam0/sensor.yaml", SHEET.replace("20.5,", ""), "yaml: intrinsics: expected 4 finite numbers"),
-        ("depth0/data.csv", "5,a.png\n", "depth0/data.csv: expected timestamps of cam0, got 5"),
-        ("depth0/data.csv", f"{STAMPS[0]},a.png\n", "depth0/data/a.png: expected an image, got nothing"),
+        ("depth0/data.csv", f"5,{STAMPS[0]}.png\n", "depth0/data.csv: expected timestamps of cam0, got 5"),
+        (
+            "depth0/data.csv",
+            f"{STAMPS[0]},a.png\n",
+            "depth0/data.csv: expected the files that it lists, got none of 1: a.png",
+        ),
     ],
 )
 def test_unusable_frames(vicon, file, content, message):
@@ -293,3 +298,41 @@ def test_real_frames_with_depth(data_dir, tmp_path):
     # At rest the IMU reads the reaction to gravity: up.
     up = (recording.T_world_cam @ np.linalg.inv(recording.T_body_cam))[0, :3, :3]
     assert (up @ recording.imu.acceleration_body[:40].mean(axis=0))[2] == pytest.approx(9.8, abs=0.2)
+
+
+@pytest.mark.parametrize("model", ["radtan", '"radial-tangential"', "plumb_bob", "'radial_tangential'"])
+@pytest.mark.parametrize(
+    "layout",
+    [
+        lambda rows: "T_BS: [" + ", ".join(f"[{', '.join(row)}]" for row in rows) + "]",
+        lambda rows: "T_BS:\n" + "".join(f"  - [{', '.join(row)}]\n" for row in rows),
+        lambda rows: "T_BS:\n  data:\n" + "".join(f"  - {x}\n" for row in rows for x in row),
+        lambda rows: "T_BS:\n  data: [" + ",\n    ".join(f"'{x}'" for row in rows for x in row) + "]",
+    ],
+)
+def test_a_sheet_says_the_same_in_every_layout_of_yaml(tmp_path, layout, model):
+    rows = [[repr(x) for x in row] for row in T_BODY_CAM.tolist()]
+    rest = CAMERA_SHEET[CAMERA_SHEET.index("rate_hz") :].replace("radial-tangential", model)
+    rest = rest.replace(
+        "intrinsics: [20.5, 21.5, 15.25, 11.75]", "intrinsics:\n- 20.5\n- 21.5\n- 15.25\n- 11.75"
+    )
+    (tmp_path / "sensor.yaml").write_text(f"{layout(rows)}\n{rest}")
+    camera, T_body_cam = read_camera_sheet(tmp_path / "sensor.yaml")
+    np.testing.assert_array_equal(T_body_cam, T_BODY_CAM)
+    assert camera[:4] == (20.5, 21.5, 15.25, 11.75) and len(camera.distortion) == 4
+
+
+def test_listed_images_that_are_not_there_are_counted(vicon, walk):
+    mav0 = vicon / "mav0"
+    (mav0 / f"cam0/data/{STAMPS[1]}.png").unlink()
+    (mav0 / f"depth0/data/{STAMPS[3]}.png").unlink()
+    (mav0 / f"cam0/data/{STAMPS[4]}.png").rename(mav0 / f"cam0/data/{STAMPS[4]}.PNG")
+    recording = euroc.load(vicon)
+    np.testing.assert_allclose(
+        recording.t, [(STAMPS[k] - STAMPS[0]) * 1e-9 for k in (0, 2, 4, 5)], atol=1e-12
+    )
+    np.testing.assert_array_equal(recording.read(2).rgb[..., 0], walk.rgb[4, ..., 0])
+    assert recording.notes[:2] == (
+        f"cam0: 1 of 6 files that data.csv lists are not there: {STAMPS[1]}.png",
+        f"depth0: 1 of 6 files that data.csv lists are not there: {STAMPS[3]}.png",
+    )

@@ -68,13 +68,14 @@ def test_gaps_and_a_moving_focus_are_told(tmp_path, walk, save):
     (folder / "depth/._000003.png").write_bytes(b"resource fork")
     lines = (folder / "odometry.csv").read_text().splitlines()
     lines[5] = ", ".join([*lines[5].split(", ")[:2], *["nan"] * 7, *lines[5].split(", ")[9:]])
-    (folder / "odometry.csv").write_text("\n".join(lines))
+    (folder / "odometry.csv").write_text("\n".join([*lines[:4], lines[3], *lines[4:]]))
     recording = stray_scanner.load(folder)
     np.testing.assert_allclose(recording.t, np.array([0, 1, 3, 4, 5]) / 60, atol=1e-9)
     assert np.abs(recording.read(2).rgb.astype(int) - walk.rgb[3]).mean() <= 4
     np.testing.assert_array_equal(np.isnan(recording.T_world_cam[:, 0, 0]), [0, 0, 0, 1, 0])
     notes = "; ".join(recording.notes)
     assert "1 of 6 frames left out, without depth or colour" in notes
+    assert "1 rows of odometry.csv left out, of a timestamp not after those before" in notes
     assert "focal length varies by 7.9%" in notes and recording.camera.fx == 31.5
     assert "1 frames without a usable pose (NaN or no quaternion): 000004" in notes
 

@@ -32,6 +32,7 @@ from jaxpose.datasets.rgbd.euroc_files import (
     read_listing,
     sensors,
 )
+from jaxpose.datasets.rgbd.frames import listed
 from jaxpose.datasets.rgbd.imu_csv import read_imu
 from jaxpose.datasets.types import Frame, Recording
 from jaxpose.errors import DataError
@@ -75,6 +76,7 @@ class CameraLog(NamedTuple):
     stamps_ns: list[int]
     files: list[Path]
     T_body_cam: Float[np.ndarray, "4 4"]
+    notes: tuple[str, ...] = ()  # on listed images that are not there
 
 
 class _Depth(NamedTuple):
@@ -149,7 +151,7 @@ def load(path: Path | str) -> Recording:
 
 
 def load_camera(path: Path | str, name: str = "cam0") -> CameraLog:
-    """Read a camera of a sequence: all images are there and of the stated size.
+    """Read a camera of a sequence; images that are listed and not there are left out and counted.
 
     Args:
         path: The sequence folder, or its `mav0`.
@@ -162,7 +164,7 @@ def load_camera(path: Path | str, name: str = "cam0") -> CameraLog:
         DataError: For files that cannot be used.
     """
     folder = sensors(path) / name
-    timestamps, files = read_listing(folder)
+    timestamps, files, missing = _images(folder)
     camera, T_body_cam = read_camera_sheet(folder / "sensor.yaml")
     size = common_size(files)
     if size != (camera.width, camera.height):
@@ -170,7 +172,15 @@ def load_camera(path: Path | str, name: str = "cam0") -> CameraLog:
             f"{folder / 'sensor.yaml'}: expected the images' resolution, {size[0]}x{size[1]}, "
             f"got {camera.width}x{camera.height}"
         )
-    return CameraLog(camera, timestamps, files, T_body_cam)
+    return CameraLog(camera, timestamps, files, T_body_cam, missing)
+
+
+def _images(folder: Path) -> tuple[list[int], list[Path], tuple[str, ...]]:
+    """Timestamps and files of the images that a camera lists and has, and a note on the others."""
+    timestamps, files = read_listing(folder)
+    names = [str(file.relative_to(folder / "data")) for file in files]
+    rows, files, notes = listed(folder / "data.csv", folder / "data", names)
+    return [timestamps[row] for row in rows], files, tuple(f"{folder.name}: {note}" for note in notes)
 
 
 def load_imu(path: Path | str, t0_ns: int | None = None) -> ImuLog:
@@ -275,7 +285,7 @@ def _find_depth(mav0: Path, cam0: CameraLog, T_world_cam: Float[np.ndarray, "n 4
 
 
 def _given_depth(folder: Path, cam0: CameraLog) -> _Depth:
-    timestamps, files = read_listing(folder)
+    timestamps, files, missing = _images(folder)
     by_stamp = dict(zip(timestamps, files, strict=True))
     rows = [row for row, timestamp in enumerate(cam0.stamps_ns) if timestamp in by_stamp]
     if not rows:
@@ -285,9 +295,8 @@ def _given_depth(folder: Path, cam0: CameraLog) -> _Depth:
     chosen = {row: by_stamp[cam0.stamps_ns[row]] for row in rows}
     common_size([cam0.files[rows[0]], *chosen.values()])
     check_depth(folder, list(chosen.values()))
-    return _Depth(
-        rows, lambda row: read_depth(chosen[row]), _left_out(cam0, rows, "no depth of their timestamp")
-    )
+    notes = (*cam0.notes, *missing, *_left_out(cam0, rows, "no depth of their timestamp"))
+    return _Depth(rows, lambda row: read_depth(chosen[row]), notes)
 
 
 def _cloud_depth(file: Path, cam0: CameraLog, T_world_cam: Float[np.ndarray, "n 4 4"]) -> _Depth:
@@ -305,7 +314,7 @@ def _cloud_depth(file: Path, cam0: CameraLog, T_world_cam: Float[np.ndarray, "n 
         f"depth from the {usable.sum()} points of {file.name}, taken to be in the frame of the ground truth"
     )
     ignored = (f"{(~usable).sum()} points with NaN or infinity ignored",) if not usable.all() else ()
-    notes = (source, *ignored, *_left_out(cam0, rows, "no true pose to see the cloud from"))
+    notes = (source, *ignored, *cam0.notes, *_left_out(cam0, rows, "no true pose to see the cloud from"))
     return _Depth(rows, lambda row: look(T_world_cam[row]), notes)
 
 

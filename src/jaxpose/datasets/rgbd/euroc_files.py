@@ -15,6 +15,7 @@ from jaxpose.geometry.camera import Camera
 from jaxpose.imu import ImuNoise
 
 _LOUDEST = 1e3  # of noise densities
+_BROWN = ("radial-tangential", "radial_tangential", "radtan", "plumb_bob")  # of EuRoC, ASL, Kalibr and ROS
 _MOST = 1e9  # [px] and coefficients of distortion
 IMU_COLUMNS = "7 columns (timestamp, 3 rates, 3 accelerations)"
 
@@ -61,8 +62,12 @@ def read_imu_sheet(file: Path) -> tuple[ImuNoise, Float[np.ndarray, "4 4"]]:
 def read_camera_sheet(file: Path) -> tuple[Camera, Float[np.ndarray, "4 4"]]:
     """Intrinsics, lens and the pose of a camera on the body."""
     content = _sheet(file)
-    choice(file, content, "distortion_model", ("radial-tangential",))
-    lens = numbers(file, content, "distortion_coefficients", (4,), least=-_MOST, most=_MOST).tolist()
+    choice(file, content, "distortion_model", _BROWN)
+    lens = numbers(file, content, "distortion_coefficients", (None,), least=-_MOST, most=_MOST).tolist()
+    if len(lens) not in (4, 5):
+        raise DataError(
+            f"{file}: distortion_coefficients: expected k1 k2 p1 p2 [k3], got {len(lens)} numbers"
+        )
     width, height = numbers(file, content, "resolution", (2,), whole=True, least=1, most=MOST_PIXELS).tolist()
     fx, fy, cx, cy = numbers(file, content, "intrinsics", (4,), least=-_MOST, most=_MOST).tolist()
     if not (fx > 0 and fy > 0 and 0 <= cx < width and 0 <= cy < height):
@@ -85,7 +90,10 @@ def _sheet(file: Path) -> dict[str, Any]:
 
 def _extrinsics(file: Path, content: dict[str, Any]) -> Float[np.ndarray, "4 4"]:
     matrix = content.get("T_BS")  # OpenCV's rows, cols and data
-    found = {"T_BS": matrix.get("data") if isinstance(matrix, dict) else matrix} if "T_BS" in content else {}
+    matrix = matrix.get("data") if isinstance(matrix, dict) else matrix
+    if isinstance(matrix, list) and matrix and all(isinstance(row, list) for row in matrix):
+        matrix = [entry for row in matrix for entry in row]
+    found = {"T_BS": matrix} if "T_BS" in content else {}
     T = numbers(file, found, "T_BS", (16,)).reshape(4, 4)
     rigid_transforms(file, "T_BS", T[None])
     return T

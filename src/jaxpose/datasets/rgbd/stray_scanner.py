@@ -53,7 +53,7 @@ def load(path: Path | str) -> Recording:
         DataError: Naming the file for anything that cannot be used.
     """
     folder = Path(path)
-    ns, numbers, table = _odometry(folder / "odometry.csv")
+    ns, numbers, table, repeated = _odometry(folder / "odometry.csv")
     depth, video = numbered(folder / "depth"), Video(folder / "rgb.mp4")
     there = [i for i, n in enumerate(numbers) if n in depth and n - numbers[0] < len(video)]
     if not there:
@@ -83,7 +83,7 @@ def load(path: Path | str) -> Recording:
         names=[depth.stem for depth in depths],
         poses=Poses(_poses(table[there]), lambda i: str(folder / "odometry.csv"), "NaN or no quaternion"),
         first_color="rgb.mp4",
-        notes=(*notes, *sensed),
+        notes=(*notes, *repeated, *sensed),
         imu=imu,
         T_body_cam=rigid.make(R_CAM_PHONE.T, np.zeros(3)),
         gravity_world=Y_UP,
@@ -108,11 +108,13 @@ def _read_csv(file: Path, least: int, columns: str) -> Float[np.ndarray, "n c"]:
     return np.array(rows)
 
 
-def _odometry(file: Path) -> tuple[list[int], list[int], Float[np.ndarray, "n c"]]:
-    """Timestamps [ns], frame numbers, and the columns behind them; of one timestamp the first row counts."""
+def _odometry(file: Path) -> tuple[list[int], list[int], Float[np.ndarray, "n c"], tuple[str, ...]]:
+    """Timestamps [ns], frame numbers, the columns behind them, and a note on rows that are left out."""
     table = _read_csv(file, 9, "timestamp, frame, x, y, z, qx, qy, qz, qw")
-    table = table[np.append(True, np.diff(table[:, 0]) > 0)]
-    return [round(t * 1e9) for t in table[:, 0].tolist()], [int(n) for n in table[:, 1]], table[:, 2:]
+    later = np.append(True, table[1:, 0] > np.maximum.accumulate(table[:, 0])[:-1])
+    note = f"{(~later).sum()} rows of odometry.csv left out, of a timestamp not after those before"
+    table, notes = table[later], () if later.all() else (note,)
+    return [round(t * 1e9) for t in table[:, 0].tolist()], [int(n) for n in table[:, 1]], table[:, 2:], notes
 
 
 def _poses(table: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "n 4 4"]:
@@ -128,7 +130,8 @@ def _imu(file: Path, t0_ns: int) -> tuple[Imu | None, tuple[str, ...]]:
     if not file.is_file():
         return None, ("no imu.csv",)
     table = _read_csv(file, 7, "timestamp, 3 accelerations, 3 rates")
-    kept = np.isfinite(table).all(axis=1) & (np.diff(table[:, 0], prepend=-np.inf) > 0)
+    later = np.append(True, table[1:, 0] > np.maximum.accumulate(table[:, 0])[:-1])
+    kept = np.isfinite(table).all(axis=1) & later
     table, lost = table[kept], int((~kept).sum())
     if len(table) < 2:
         return None, ("imu.csv has no readings",)
