@@ -205,6 +205,37 @@ def test_a_run_is_a_reference_too(run_folder):
     assert result.ate_m.max < 1e-9 and result.pairs == 31
 
 
+@pytest.fixture
+def desk(tmp_path, walk, save):
+    """A plain folder of six stamped frames, true poses for five of them."""
+    poses = walk.T_world_cam.copy()
+    poses[2] = np.nan
+    for k in range(6):
+        save(tmp_path / f"desk/color/{k}.png", walk.rgb[k])
+        save(tmp_path / f"desk/depth/{k}.png", walk.counts[k])
+    (tmp_path / "desk/camera-intrinsics.txt").write_text("30 0 15.5\n0 31 11.5\n0 0 1\n")
+    np.savetxt(tmp_path / "desk/times.txt", 1.6e9 + np.arange(6) / 10, fmt="%.9f")
+    np.savetxt(tmp_path / "desk/poses.txt", poses.reshape(6, 16))
+    return tmp_path / "desk"
+
+
+def test_a_recording_is_a_reference(desk, walk, tmp_path):
+    """Its true poses are those of the file that states them."""
+    estimate = walk.T_world_cam.copy()
+    estimate[0, :3, 3] += [0.3, 0, 0]
+    trajectories.write_tum(tmp_path / "e.txt", trajectories.Trajectory(1.6e9 + np.arange(6) / 10, estimate))
+    result = evaluate.run(Config(tmp_path / "e.txt", desk, align="none"))
+    assert result.pairs == 5 and "(1 frames without a true pose)" in result.reference
+    assert result.ate_m.max == pytest.approx(0.3, abs=1e-6) and result.ate_m.median == pytest.approx(
+        0, abs=1e-6
+    )
+    (desk / "poses.txt").unlink()
+    with pytest.raises(
+        DataError, match="desk: expected a recording with true poses, got a plain one without"
+    ):
+        evaluate.run(Config(tmp_path / "e.txt", desk))
+
+
 def test_json_is_all_that_is_printed(files, capsys):
     main_command.main(["eval", *map(str, files), "--json", "--align", "sim3", "--rpe-frames", "1", "5"])
     said = capsys.readouterr()

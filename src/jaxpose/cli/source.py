@@ -14,6 +14,7 @@ from jaxpose.files.timestamps import format_ns
 from jaxpose.files.untrusted import read_json
 
 FIELD = "field.npz"
+_RECORDINGS = (".bag", ".mcap", ".db3", ".r3d")  # suffixes of files that are recordings
 
 
 class Source(NamedTuple):
@@ -24,6 +25,7 @@ class Source(NamedTuple):
     trajectory: trajectories.Trajectory
     stamped: bool  # False: the pose of line i is said to be at i seconds
     file: trajectories.TrajectoryFile | None = None  # None: a run
+    is_recording: bool = False  # whose true poses these are
 
     @property
     def is_run(self) -> bool:
@@ -46,10 +48,12 @@ class Source(NamedTuple):
 
 
 def read_source(path: Path, columns: str | None = None) -> Source:
-    """Read a trajectory file or the trajectory of a run folder; DataError or OSError for what is neither.
+    """Read a trajectory file, the trajectory of a run folder, or the true poses of a recording.
 
-    `columns` names those of a file, as `read_trajectory` says.
+    DataError or OSError for what is none of them. `columns` names those of a file, as `read_trajectory` says.
     """
+    if path.suffix.lower() in _RECORDINGS and path.is_file() and (found := _recording(path)) is not None:
+        return found
     if not path.is_dir():
         if not path.exists():
             raise DataError(f"{path}: expected a trajectory file or a run folder, got nothing")
@@ -59,6 +63,8 @@ def read_source(path: Path, columns: str | None = None) -> Source:
         raise DataError(f"{path}: expected a file for --columns {columns!r}, got a folder")
     file = path / "trajectory.txt"
     if not file.is_file():
+        if (found := _recording(path)) is not None:
+            return found
         inner = sorted(folder.parent.name for folder in path.glob("*/trajectory.txt"))
         hint = f"runs in it: {', '.join(inner)}" if inner else "none"
         raise DataError(f"{path}: expected a run folder with trajectory.txt, got {hint}")
@@ -66,6 +72,24 @@ def read_source(path: Path, columns: str | None = None) -> Source:
     # A run's files are all on one clock, which its field takes as float64 seconds.
     trajectory = trajectories.Trajectory(trajectories.since(trajectory, 0), trajectory.T)
     return Source(path, f"{_experiment(path / 'results.json')} run".strip(), trajectory, True)
+
+
+def _recording(path: Path) -> Source | None:
+    """The true poses of a recording; None for what is none, DataError for one without."""
+    from jaxpose.datasets.rgbd import registry  # here, as its room loads jax
+
+    form = registry.detect(path)
+    if form is None:
+        return None
+    recording = registry.load_recording(path, form)
+    if recording.T_world_cam is None:
+        raise DataError(f"{path}: expected a recording with true poses, got a {form} one without")
+    known = np.isfinite(recording.T_world_cam).all((1, 2))
+    trajectory = trajectories.Trajectory(recording.t[known], recording.T_world_cam[known], recording.t0_ns)
+    missing, stamped = int((~known).sum()), registry.has_timestamps(path, form)
+    notes = (f"{missing} frames without a true pose",) if missing else ()
+    file = trajectories.TrajectoryFile(trajectory, "TUM", stamped, notes, 0, missing, len(recording.t))
+    return Source(path, f"{form} recording", trajectory, stamped, file, is_recording=True)
 
 
 def read_field(source: Source) -> Callable[[Float[np.ndarray, " n"]], Float[np.ndarray, "n 4 4"]]:

@@ -137,6 +137,6 @@ def test_slam_runs_on_each_kind(tmp_path, room, save, capsys, kind):
     (tmp_path / "data").mkdir()
     path = KINDS[kind](tmp_path / "data", room, save)
     main(["--data", str(path), "--smoke", "--out", str(tmp_path / "run"), "--json"])
-    results = json.loads(capsys.readouterr().out)
+    results = json.loads(capsys.readouterr().out)["results"]
     assert results["ate_rmse_m"] < 0.05, results["ate_rmse_m"]
     assert sorted(file.name for file in tmp_path.iterdir()) == ["data", "run"]
