@@ -187,15 +187,16 @@ def opened_hdf5(path: Path | str, wanted: str) -> Iterator[Any]:
         yield content
 
 
-def hdf5_column(content: Any, name: str) -> Any:
-    """A row of numbers of an HDF5 file, to be read in pieces.
+def hdf5_column(content: Any, name: str, *, table: bool = False) -> Any:
+    """A row of numbers of an HDF5 file, or a table of them, to be read in pieces.
 
     Args:
         content: the open file.
         name: of the data set.
+        table: whether rows have named fields, or are of four numbers.
 
     Returns:
-        The data set; None where there is none of one axis with numbers.
+        The data set; None where there is none of that kind.
 
     Raises:
         ValueError: for one that the file cannot hold: HDF5 allots space of any size that nothing fills.
@@ -204,12 +205,16 @@ def hdf5_column(content: Any, name: str) -> Any:
 
     link = content.get(name, getlink=True)
     column = content.get(name) if isinstance(link, h5py.HardLink) else None  # others lead to other files
-    if not isinstance(column, h5py.Dataset) or column.ndim != 1 or column.dtype.kind not in "biuf":
+    if not isinstance(column, h5py.Dataset):
+        return None
+    named = column.ndim == 1 and column.dtype.names is not None
+    numbers = column.dtype.kind in "biuf" and (column.shape[1:] == (4,) if table else column.ndim == 1)
+    if not (numbers or (table and named)):
         return None
     if column.external or column.is_virtual:
         raise ValueError(f"{name} in another file")
     stored = column.id.get_storage_size()
-    if len(column) * column.dtype.itemsize > 100 * _DEFLATE * stored:
+    if column.size * column.dtype.itemsize > 100 * _DEFLATE * stored:
         raise ValueError(f"{len(column)} numbers of {name} in {stored} bytes")
     return column
 

@@ -160,7 +160,6 @@ def viewer(
     Returns:
         The two functions.
     """
-
     colour = lambda params, ray, depth: ray_colour(scene, params, ray, depth, background)
 
     def image(scene_params, T_world_cam):

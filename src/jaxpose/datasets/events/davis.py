@@ -73,7 +73,7 @@ def load(
         return recording
     images = read_list(folder / "images.txt")
     frames, notes = _frames(folder, images.t - zero_s, images.files, recording)
-    return recording._replace(frames=frames, notes=(*recording.notes, *notes))
+    return recording._replace(frames=frames, notes=(*recording.notes, *images.notes, *notes))
 
 
 def find(path: Path | str, *, size: tuple[int, int] | None = None) -> Source:

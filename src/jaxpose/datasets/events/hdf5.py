@@ -1,8 +1,9 @@
-"""Events in HDF5 as DSEC has them: `events/{x,y,p,t}` with t in microseconds, and `t_offset`."""
+"""Events in HDF5: columns as DSEC has them, `events/{x,y,p,t}` and `t_offset`, other names, or a table."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -15,9 +16,23 @@ from jaxpose.events import Mosaic
 from jaxpose.files.untrusted import hdf5_column, opened_hdf5
 
 _SUFFIXES = (".h5", ".hdf5")
-_NAMES = ("t", "x", "y", "p")
+# What groups call the time, column, row and polarity of events, and the groups and tables that have them: of
+# DSEC and others, v2e, MVSEC, Metavision, M3ED; of two cameras the left one.
+_NAMES = (
+    ("t", "x", "y", "p"),
+    ("ts", "xs", "ys", "ps"),
+    ("timestamps", "x", "y", "polarities"),
+    ("timestamp", "x", "y", "polarity"),
+    ("time", "x", "y", "polarity"),
+)
+_GROUPS = ("events/", "", "CD/events/", "prophesee/left/", "davis/left/events/")
+_TABLES = ("events", "CD/events", "davis/left/events", "data")
+_ORDERS = ([0, 1, 2, 3], [2, 0, 1, 3], [3, 0, 1, 2])
+_ECF = 0x8ECF
 _FOLDERS = (".", "events/left", "left")  # in DSEC each camera has its own
 _OTHERS = ("rectify_map.h5",)  # of DSEC, with no events in it
+
+_Read = Callable[[int, int], Any]  # t, x, y and p of the events from one row to before another
 
 
 def detect(path: Path) -> bool:
@@ -40,12 +55,13 @@ def load(
     unit: Unit | None = None,
     span: tuple[float, float] | None = None,
 ) -> EventRecording:
-    """Read events in HDF5, as DSEC has them. Needs h5py and hdf5plugin (extra `hdf5`).
+    """Read events in HDF5. Needs h5py and hdf5plugin (extra `hdf5`).
 
-    `events/` has x, y, p and t, t in microseconds, to which `t_offset` is added where there is one; time 0 is
-    the first event's timestamp. `ms_to_idx` is not used. Pixels are as recorded, not rectified. In the folder
-    of the file may lie `poses.txt`, T_world_cam in TUM's format on the clock of t + t_offset, and the camera
-    (`sidecar.with_camera`).
+    `events/` (or the file itself, or `CD/events`) has x, y, p and t, or xs, ys, ps and ts, or is a table
+    of them. t is in microseconds if that gives a possible rate, else in what does; `t_offset` is added
+    where there is one; time 0 is the first event's timestamp. `ms_to_idx` is not used. Pixels are as
+    recorded, not rectified. In the folder of the file may lie `poses.txt`, T_world_cam in TUM's format on
+    the clock of t + t_offset, and the camera (`sidecar.with_camera`).
 
     Args:
         path: The file, or a folder with a single one, in it or in its `events/left`.
@@ -85,7 +101,7 @@ def find(path: Path | str, *, size: tuple[int, int] | None = None) -> Source:
 
 def _files(folder: Path) -> list[Path]:
     for place in _FOLDERS:
-        files = [file for file in sorted((folder / place).glob("*")) if file.suffix in _SUFFIXES]
+        files = [file for file in sorted((folder / place).glob("*")) if file.suffix.lower() in _SUFFIXES]
         files = [file for file in files if file.name not in _OTHERS]
         if files:
             return files
@@ -100,24 +116,80 @@ def _file(path: Path) -> Path:
 
 def _blocks(file: Path) -> Iterator[Block]:
     with opened_hdf5(file, "an HDF5 file") as content:
-        columns = [_column(file, content, name) for name in _NAMES]
-        lengths = {len(column) for column in columns}
-        if len(lengths) != 1:
-            got = ", ".join(f"{len(column)} {name}" for name, column in zip(_NAMES, columns, strict=True))
-            raise DataError(f"{file}: expected events/ with columns of one length, got {got}")
+        read, length = _columns(file, content) or _table(content) or _none(file, content)
         offset = int(np.asarray(content.get("t_offset", 0)))
-        for start in range(0, lengths.pop(), BLOCK):
-            t, *others = (column[start : start + BLOCK] for column in columns)
+        for start in range(0, length, BLOCK):
+            t, *others = read(start, start + BLOCK)
             if t.dtype.kind in "iu":
                 t = t.astype(np.int64)
             yield Block(t + offset, *others)
 
 
-def _column(file: Path, content: Any, name: str) -> Any:
-    """The data set of one column."""
-    column = hdf5_column(content, f"events/{name}")
-    if column is None:
-        events = content.get("events")
-        got = some(sorted(events if hasattr(events, "keys") else content)) or "none"
-        raise DataError(f"{file}: expected events/ with x y p t, a row of numbers each, got {got}")
-    return column
+def _columns(file: Path, content: Any) -> tuple[_Read, int] | None:
+    """Events as four rows of numbers in one group."""
+    for place in _GROUPS:
+        for names in _NAMES:
+            columns = [hdf5_column(content, f"{place}{name}") for name in names]
+            if any(column is None for column in columns):
+                continue
+            lengths = {len(column) for column in columns}
+            if len(lengths) != 1:
+                got = ", ".join(f"{len(c)} {name}" for name, c in zip(names, columns, strict=True))
+                raise DataError(f"{file}: expected {place} with columns of one length, got {got}")
+            for column in columns:
+                _check_filters(column)
+            return lambda start, stop, c=columns: [column[start:stop] for column in c], lengths.pop()
+    return None
+
+
+def _table(content: Any) -> tuple[_Read, int] | None:
+    """Events as one table, of named fields or of four columns."""
+    for place in _TABLES:
+        table = hdf5_column(content, place, table=True)
+        if table is None:
+            continue
+        _check_filters(table)
+        if table.dtype.names is None:
+            order = _order(place, np.asarray(table[:BLOCK], np.float64))
+            return partial(_by_order, table, order), len(table)
+        for names in _NAMES:
+            if set(names) <= set(table.dtype.names):
+                return partial(_by_name, table, names), len(table)
+    return None
+
+
+def _by_order(table: Any, order: list[int], start: int, stop: int) -> list[np.ndarray]:
+    return list(table[start:stop].T[order])
+
+
+def _by_name(table: Any, names: tuple[str, ...], start: int, stop: int) -> list[np.ndarray]:
+    rows = table[start:stop]
+    return [rows[name] for name in names]
+
+
+def _order(place: str, rows: np.ndarray) -> list[int]:
+    """Columns of t, x, y and p in a table without names: the time rises, polarities are two."""
+    rises = (np.diff(rows, axis=0) >= 0).all(0) & (np.ptp(rows, axis=0) > 0)
+    fits = [order for order in _ORDERS if rises[order[0]] and (np.abs(rows[:, order[3]]) <= 1).all()]
+    if len(fits) != 1:
+        got = "several of them" if fits else "none of them"
+        raise ValueError(f"a table {place} whose columns are t x y p, x y t p or x y p t by {got}")
+    return fits[0]
+
+
+def _check_filters(column: Any) -> None:
+    """ValueError for data compressed by what is not installed."""
+    import h5py
+
+    plan = column.id.get_create_plist()
+    for k in range(plan.get_nfilters()):
+        number, *_, name = plan.get_filter(k)
+        if not h5py.h5z.filter_avail(number):
+            which = "Prophesee's ECF (hdf5_ecf, HDF5_PLUGIN_PATH)" if number == _ECF else name.decode()
+            raise ValueError(f"{column.name} compressed by filter {number}, not installed: {which}")
+
+
+def _none(file: Path, content: Any) -> NoReturn:
+    events = content.get("events")
+    got = some(sorted(events if hasattr(events, "keys") else content)) or "none"
+    raise DataError(f"{file}: expected events/ with x y p t, a row of numbers each, got {got}")
