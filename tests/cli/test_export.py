@@ -19,6 +19,7 @@ from jaxpose.errors import DataError
 from jaxpose.fields import numpy_evaluator
 from jaxpose.files import atomic, trajectories
 from jaxpose.files.camera_json import read_camera, write_camera
+from jaxpose.files.ply import write_ply
 from jaxpose.geometry.camera import Camera
 
 COUNT, SPAN = 16, (0.0, 3.0)
@@ -76,6 +77,21 @@ def test_poses_come_back_from_trajectory_files(run, tmp_path, format, stamped):
         assert "no timestamps" in " ".join(result.notes)
 
 
+def test_times_of_kitti_lie_beside(run, tmp_path):
+    exported(run, "kitti", tmp_path / "00.txt")
+    np.testing.assert_array_equal(np.loadtxt(tmp_path / "00_times.txt"), poses_of(run).t)
+
+
+def test_keys_that_nerfstudio_documents(run, tmp_path):
+    """fl_x, w, h and ply_file_path as its documentation lists them; time as D-NeRF has it."""
+    write_ply(run / "points.ply", np.zeros((2, 3)), np.zeros((2, 3), np.uint8))
+    exported(run, "transforms", tmp_path / "out" / "transforms.json")
+    content = json.loads((tmp_path / "out" / "transforms.json").read_text())
+    assert (content["w"], content["h"], content["fl_x"], content["camera_model"]) == (48, 32, 44.0, "OPENCV")
+    assert (tmp_path / "out" / content["ply_file_path"]).samefile(run / "points.ply")
+    assert [frame["time"] for frame in content["frames"]] == poses_of(run).t.tolist()
+
+
 def test_poses_come_back_from_transforms(run, tmp_path):
     result = exported(run, "transforms", tmp_path / "poses" / "transforms.json")
     assert "48x32; the run used 24x16" in " ".join(result.notes)
@@ -90,8 +106,16 @@ def test_poses_come_back_from_transforms(run, tmp_path):
             np.testing.assert_allclose(pose, written[k], atol=1e-12)
 
 
-def test_poses_come_back_from_colmap(run, tmp_path):
-    exported(run, "colmap", tmp_path / "sparse" / "0")
+@pytest.mark.parametrize("format", ["colmap", "colmap_binary"])
+def test_poses_and_points_come_back_from_colmap(run, tmp_path, format):
+    points, rgb = np.random.default_rng(1).normal(size=(9, 3)), np.full((9, 3), 7, np.uint8)
+    write_ply(run / "points.ply", points, rgb)
+    result = exported(run, format, tmp_path / "sparse" / "0")
+    assert "9 points of points.ply" in result.notes[-1]
+    read = pycolmap.Reconstruction(tmp_path / "sparse" / "0")
+    assert {tuple(p.xyz) for p in read.points3D.values()} == {
+        tuple(p) for p in points.astype(np.float32).tolist()
+    }
     read = pycolmap.Reconstruction(tmp_path / "sparse" / "0")
     written = poses_of(run).T
     assert len(read.images) == COUNT

@@ -29,9 +29,12 @@ from jaxpose.files.timestamps import format_ns
 if TYPE_CHECKING:
     from jaxpose.geometry.camera import Camera
 
-Format = Literal["tum", "csv", "kitti", "euroc", "transforms", "colmap", "npz", "same"]
+Format = Literal["tum", "csv", "kitti", "euroc", "transforms", "colmap", "colmap_binary", "npz", "same"]
 _SAME: dict[str, Format] = {"TUM": "tum", "CSV": "csv", "KITTI": "kitti", "EuRoC": "euroc"}
 _OWN_NS = 1000  # timestamps closer than this are the same: others write float64 seconds since 1970, to 240 ns
+
+
+_MOST_POINTS = 200_000  # of a COLMAP model
 
 
 @dataclass(frozen=True)
@@ -41,8 +44,8 @@ class Config:
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]  # run folder, or trajectory file
     # tum: `t tx ty tz qx qy qz qw`; csv: the same between commas; kitti: 3x4 matrices without timestamps;
     # euroc: csv with timestamps in ns, quaternion wxyz; same: the one of these that RUN is a file of;
-    # transforms: transforms.json for nerfstudio and instant-ngp; colmap: a text model; npz: the continuous
-    # trajectory itself, which `jaxpose/fields/numpy_evaluator.py` evaluates with numpy alone.
+    # transforms: transforms.json for nerfstudio and instant-ngp; colmap: a model in text or binary; npz: the
+    # continuous trajectory itself, which `jaxpose/fields/numpy_evaluator.py` evaluates with numpy alone.
     format: Format
     out: Path  # file to write; colmap: folder
     rate_hz: float | None = None  # [Hz] poses at this rate from the first frame on; None: at the frames
@@ -55,7 +58,7 @@ class Config:
         check_apart("--out", self.out, self.run, self.at)
         if self.rate_hz is not None and self.at is not None:
             raise ValueError("--at: expected no --rate-hz with it")
-        if self.format in ("transforms", "colmap", "npz") and (self.rate_hz or self.at):
+        if self.format in ("transforms", "colmap", "colmap_binary", "npz") and (self.rate_hz or self.at):
             why = "is for any time" if self.format == "npz" else "says where each image was taken"
             raise ValueError(f"--format {self.format}: expected no --rate-hz and no --at, as the file {why}")
 
@@ -109,10 +112,19 @@ def run(config: Config, on_update: OnUpdate = silent) -> Result:
         trajectories.write_euroc(config.out, trajectory, xyzw)
     elif form == "kitti":
         trajectories.write_kitti(config.out, trajectory.T)
-        notes += ("the format has no timestamps: line i is pose i",)
+        notes += _kitti_times(config, source, trajectory)
     else:
         notes += _with_images(config, source, trajectory)
     return Result(str(source), config.out, form, len(trajectory.t), times, notes)
+
+
+def _kitti_times(config: Config, source: Source, trajectory: trajectories.Trajectory) -> tuple[str, ...]:
+    """The timestamps of KITTI's lines, in a file of their own as KITTI has them; a note on it."""
+    if not source.stamped:
+        return ("the format has no timestamps: line i is pose i",)
+    file = config.out.with_name(f"{config.out.stem}_times.txt")
+    atomic.write_text(file, "".join(f"{t!r}\n" for t in np.asarray(trajectory.t, np.float64).tolist()))
+    return (f"the format has no timestamps: those of its lines are in {file}",)
 
 
 def main(args: Sequence[str] | None = None, prog: str = "jaxpose export") -> None:
@@ -209,6 +221,11 @@ def _with_images(config: Config, source: Source, trajectory: trajectories.Trajec
     t, T_world_cam, _ = trajectory
     if images and len(images) != len(t):
         raise DataError(f"{source.path}: expected {len(images)} poses, one an image, got {len(t)}")
+    if not images and (source.path / "transforms.json").is_file():
+        raise DataError(
+            f"{source.path}: expected images of one camera for --format {config.format}, got a run that "
+            "brought them to one: its transforms.json has the poses with the lens of each"
+        )
     found, notes = images_on_disk(folder, images), ()
     if found:
         camera, notes = _as_on_disk(camera, found[0])
@@ -219,16 +236,34 @@ def _with_images(config: Config, source: Source, trajectory: trajectories.Trajec
     else:
         images = tuple(f"frame-{number:06d}.png" for number in range(len(t)))
         notes = ("the images of the run are on no disk: their names are made up",)
-    if config.format == "colmap":
-        write_colmap(config.out, camera, images, T_world_cam)
-        return *notes, "no points; image names are relative to " + (str(folder) if found else "their folder")
+    cloud = source.path / "points.ply"
+    if config.format != "transforms":
+        points, rgb, told = _points(cloud)
+        binary = config.format == "colmap_binary"
+        write_colmap(config.out, camera, images, T_world_cam, points=points, rgb=rgb, binary=binary)
+        return *notes, f"{told}; image names are relative to {folder if found else 'their folder'}"
     if found:
         images = tuple(os.path.relpath(file.resolve(), config.out.parent.resolve()) for file in found)
     pixels = np.empty((len(t), 0, 0, 3), np.uint8)  # only names are written; depths are unknown
     name = source.path.name
     shots = Photographs(name, camera, t, pixels, T_world_cam, np.nan, np.nan, "disparity", images)
-    write_transforms(config.out, shots)
+    here = config.out.parent.resolve()
+    write_transforms(
+        config.out, shots, points=os.path.relpath(cloud.resolve(), here) if cloud.is_file() else None
+    )
     return *notes, "axes right, up, back, as these files have them"
+
+
+def _points(file: Path) -> tuple[np.ndarray | None, np.ndarray | None, str]:
+    """The points of a run with their colours, not more than trainers begin with, and what there is to say."""
+    from jaxpose.files.ply import read_coloured_points
+
+    if not file.is_file():
+        return None, None, "no points"
+    points, rgb = read_coloured_points(file)
+    chosen = np.unique(np.linspace(0, len(points) - 1, min(len(points), _MOST_POINTS)).round().astype(int))
+    share = "" if len(chosen) == len(points) else f" of {len(points)}"
+    return points[chosen], rgb[chosen], f"{len(chosen)}{share} points of {file.name}, without their matches"
 
 
 def _as_on_disk(camera: "Camera", file: Path) -> tuple["Camera", tuple[str, ...]]:

@@ -7,6 +7,7 @@ from . import trajectories as trajectories
 from .association import associate as associate
 from .colmap import read_colmap as read_colmap
 from .colmap import write_colmap as write_colmap
+from .ply import read_coloured_points as read_coloured_points
 from .ply import read_points as read_points
 from .ply import write_ply as write_ply
 from .trajectories import Trajectory as Trajectory

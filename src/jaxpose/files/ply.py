@@ -21,6 +21,32 @@ _TYPES = {
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 
 
+def read_coloured_points(path: Path | str) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
+    """Read points with colours, as `write_ply` writes them.
+
+    Args:
+        path: A binary PLY file whose vertices have x, y, z and red, green, blue of 8 bits.
+
+    Returns:
+        x, y, z (n, 3), float64, and colours (n, 3).
+
+    Raises:
+        DataError: Naming the file for what cannot be read.
+    """
+    path = Path(path)
+    with path.open("rb") as stream:
+        form, count, properties, _ = _header(path, stream)
+        wanted = dict.fromkeys(("red", "green", "blue"), "u1")
+        if form == "ascii" or any(dict(properties).get(name) != code for name, code in wanted.items()):
+            raise DataError(f"{path}: expected binary vertices with red green blue of 8 bits, got others")
+        kind = np.dtype([(name, _ORDERS[form] + code) for name, code in properties])
+        vertices = np.fromfile(stream, kind, count)
+    if len(vertices) != count:
+        raise DataError(f"{path}: expected {count} vertices, got {len(vertices)}")
+    points = np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    return points, np.stack([vertices[name] for name in wanted], axis=1)
+
+
 def read_points(path: Path | str) -> Float[np.ndarray, "n 3"]:
     """Read the vertices of a PLY file, ascii or binary; all else in it is passed over.
 

@@ -35,7 +35,7 @@ _COLMAP: dict[str, tuple[bool, Kind, tuple[str, ...]]] = {
         False, "thin_prism_fisheye", ("k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1"),
     ),
 }  # fmt: skip
-_ORDER: dict[Kind, tuple[str, ...]] = {
+ORDER: dict[Kind, tuple[str, ...]] = {
     "opencv": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
     "radial4": ("k1", "k2", "p1", "p2", "k3", "k4"),
     "fisheye": ("k1", "k2", "k3", "k4"),
@@ -73,7 +73,7 @@ class Lens(NamedTuple):
 
 def lens(kind: Kind, pinhole: Sequence[float], size: tuple[int, int], coefficients: dict[str, float]) -> Lens:
     """A lens by the names of its coefficients; `pinhole` is fx, fy, cx, cy, `size` width and height."""
-    values = tuple(float(coefficients.get(name, 0.0)) for name in _ORDER[kind])
+    values = tuple(float(coefficients.get(name, 0.0)) for name in ORDER[kind])
     plain = kind in ("opencv", "radial4") and not any(values)
     fx, fy, cx, cy = map(float, pinhole)
     return Lens("opencv" if plain else kind, fx, fy, cx, cy, *size, () if plain else values)
@@ -97,7 +97,7 @@ def from_colmap(camera: ColmapCamera, where: str) -> Lens:
 
 def from_camera(camera: Camera) -> Lens:
     """The same as a `Lens`."""
-    named = dict(zip(_ORDER["opencv"], camera.distortion, strict=False))
+    named = dict(zip(ORDER["opencv"], camera.distortion, strict=False))
     return lens("opencv", camera[:4], (camera.width, camera.height), named)
 
 
@@ -175,7 +175,7 @@ def _distort(seen: Lens, xy: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n
     if not seen.coefficients:
         return xy
     r2 = (xy * xy).sum(-1, keepdims=True)
-    c = dict(zip(_ORDER[seen.kind], seen.coefficients, strict=True))
+    c = dict(zip(ORDER[seen.kind], seen.coefficients, strict=True))
     if seen.kind == "fisheye":
         return xy * (1 + r2 * (c["k1"] + r2 * (c["k2"] + r2 * (c["k3"] + r2 * c["k4"]))))
     if seen.kind == "opencv":

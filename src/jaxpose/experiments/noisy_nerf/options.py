@@ -10,6 +10,7 @@ from jaxtyping import Float
 from scipy.spatial.distance import pdist
 
 from jaxpose.datasets.photos.registry import load_photographs
+from jaxpose.datasets.photos.transforms_json import stated
 from jaxpose.datasets.synthetic import pose_noise
 from jaxpose.datasets.synthetic.orbit import DIAMETER, orbit
 from jaxpose.datasets.types import Photographs, every, take
@@ -142,6 +143,10 @@ def load(config: Config) -> Problem:
         )
     extent = DIAMETER if config.data == ORBIT else float(pdist(train.T_world_cam[:, :3, 3]).max())
     T_start, words = _disturbed(config, train, extent)
+    strange = sorted({seen.kind for seen in train.lenses if stated(seen) is None})
+    unwritten = [
+        f"transforms.json has no lens {kind}: trajectory.txt alone holds the poses" for kind in strange
+    ]
     metadata = {
         "data": "synthetic orbit" if config.data == ORBIT else train.name,
         "images": len(train.t),
@@ -149,7 +154,7 @@ def load(config: Config) -> Problem:
         "size": (train.camera.width, train.camera.height),
         "extent": extent,
         "noise": words,
-        "notes": train.notes,
+        "notes": (*train.notes, *unwritten),
     }
     return Problem(train, held_out, T_start, extent, metadata)
 

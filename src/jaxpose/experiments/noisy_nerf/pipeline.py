@@ -19,8 +19,9 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxpose.datasets.photos import blender
+from jaxpose.datasets.photos.lens import as_camera
 from jaxpose.datasets.photos.registry import find_format, images_folder
-from jaxpose.datasets.photos.transforms_json import write_transforms
+from jaxpose.datasets.photos.transforms_json import stated, write_transforms
 from jaxpose.experiments import devices, training_loop
 from jaxpose.experiments.command import MODULE, Command, execute
 from jaxpose.experiments.devices import Job
@@ -210,7 +211,10 @@ def _write_poses(folder: Path, config: Config, problem: Problem, measured: Measu
     with atomic.atomic(folder / "start.npz") as temporary:
         np.savez(temporary, t=photographs.t, T_world_cam=problem.T_start)
     images = "." if config.data == ORBIT else images_folder(config.data).resolve()
-    write_camera(folder / "camera.json", photographs.camera, photographs.files, images)
+    # The camera of the run is that of the files only where they were not brought to another.
+    own = len(set(photographs.lenses)) == 1 and as_camera(photographs.lenses[0]) is not None
+    names = photographs.files if own or not photographs.lenses else ()
+    write_camera(folder / "camera.json", photographs.camera, names, images)
     if config.data == ORBIT:  # its images are on no disk yet
         for part in (photographs, problem.held_out):
             for name, rgb in zip(part.files, part.rgb, strict=True):
@@ -220,7 +224,7 @@ def _write_poses(folder: Path, config: Config, problem: Problem, measured: Measu
         write_transforms(folder / "transforms_train.json", refined)
     elif find_format(config.data) == "transforms":
         write_transforms(folder / "transforms.json", refined, source=blender.transforms_file(config.data))
-    else:
+    elif all(stated(seen) is not None for seen in refined.lenses):  # else a note of `load` says so
         write_transforms(folder / "transforms.json", refined)
 
 
