@@ -323,3 +323,50 @@ def test_help_is_quick_and_says_what_there_is():
     assert short.returncode == 0 and "eval" in short.stdout and "export" in short.stdout
     wrong = subprocess.run([sys.executable, "-m", "jaxpose", "eval", "a"], capture_output=True, text=True)
     assert (wrong.returncode, wrong.stdout, len(wrong.stderr.splitlines())) == (1, "", 1)
+
+
+def test_utm_coordinates_change_no_number(tmp_path, files):
+    """Both a world away: the same errors, and the same digits of time."""
+    away = np.array([453_217.125, 5_411_932.875, 312.5])
+    near = evaluate.run(Config(*files))
+    for file in files:
+        read = trajectories.read_tum(file)
+        T = read.T.copy()
+        T[:, :3, 3] += away
+        trajectories.write_tum(file, read._replace(T=T))
+    far = evaluate.run(Config(*files))
+    assert far.ate_m.rmse == pytest.approx(near.ate_m.rmse, abs=1e-8)
+    assert far.rotation_deg.rmse == pytest.approx(near.rotation_deg.rmse, abs=1e-6)
+    for ours, theirs in zip(far.rpe, near.rpe, strict=True):
+        assert ours.translation_m.rmse == pytest.approx(theirs.translation_m.rmse, abs=1e-8)
+
+
+@pytest.mark.parametrize("wiggle", [0.0, 1e-3])
+def test_a_straight_path_leaves_a_rotation_free(tmp_path, capsys, wiggle):
+    """Turned about the path by 177 degrees, the positions are the same but for noise."""
+    ground_truth, _ = paths()
+    rng = np.random.default_rng(1)
+    T = np.tile(np.eye(4), (60, 1, 1))
+    T[:, :3, 3] = np.outer(np.linspace(0, 5, 60), [0.6, 0.8, 0.0]) + wiggle * rng.normal(size=(60, 3))
+    estimate = T.copy()
+    turn = Rotation.from_rotvec(np.radians(177) * np.array([0.6, 0.8, 0.0])).as_matrix()
+    estimate[:, :3, :3], estimate[:, :3, 3] = turn, T[:, :3, 3] + 3 * wiggle * rng.normal(size=(60, 3))
+    for name, poses in (("a.txt", estimate), ("b.txt", T)):
+        trajectories.write_tum(tmp_path / name, ground_truth._replace(T=poses))
+    result = evaluate.run(Config(tmp_path / "a.txt", tmp_path / "b.txt"))
+    assert np.isnan(result.rotation_deg.rmse) and "the path is straight" in result.notes[-1]
+    main_command.main(["eval", str(tmp_path / "a.txt"), str(tmp_path / "b.txt")])
+    (row,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("| rotation")]
+    assert "free" in row and "177" not in row
+    as_they_are = evaluate.run(Config(tmp_path / "a.txt", tmp_path / "b.txt", align="none"))
+    assert as_they_are.rotation_deg.rmse == pytest.approx(177, abs=0.1)
+
+
+def test_what_does_not_match_in_time_names_the_files_and_the_nearest(files):
+    read = trajectories.read_tum(files[0])
+    trajectories.write_tum(files[0], read._replace(t=read.t + 0.025 + 10))
+    line = refused.complaint(main_command.main, "eval", *files)
+    assert str(files[0]) in line and str(files[1]) in line and "--max-difference-s" in line
+    assert re.search(
+        r"1600000000\.000 to 1600000003\.000 s, got 16000000\d\d\.\d+ to .*: nearest timestamps", line
+    )

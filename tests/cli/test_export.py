@@ -265,3 +265,27 @@ def test_the_command(run, tmp_path, capsys):
             main_command.main(["export", str(run), *args])
         line = stop.value.code
         assert isinstance(line, str) and "\n" not in line and message in line, line
+
+
+def test_same_keeps_every_digit(tmp_path):
+    """Nanoseconds since 1970, positions in UTM, quaternions of five digits, in the ASL layout."""
+    rows = [
+        [
+            str(1_403_715_523_912_143_101 + 5_000_001 * k),
+            "453217.123456789",
+            "5411932.987654321",
+            f"0.{k}",
+            *q,
+        ]
+        for k, q in enumerate([["0.70711", "0.0", "0.0", "-0.70711"]] * 9, 1)
+    ]
+    (tmp_path / "data.csv").write_text("".join(",".join(row) + "\n" for row in rows))
+    result = exported(tmp_path / "data.csv", "same", tmp_path / "out.csv")
+    assert result.format == "euroc"
+    assert [line.split(",") for line in (tmp_path / "out.csv").read_text().splitlines()[1:]] == rows
+    exported(tmp_path / "data.csv", "tum", tmp_path / "out.txt")
+    exported(tmp_path / "out.txt", "euroc", tmp_path / "again.csv")
+    assert (tmp_path / "again.csv").read_text() == (tmp_path / "out.csv").read_text()
+    exported(tmp_path / "out.txt", "csv", tmp_path / "seconds.csv")
+    assert exported(tmp_path / "seconds.csv", "same", tmp_path / "same.csv").format == "csv"
+    assert (tmp_path / "same.csv").read_text() == (tmp_path / "seconds.csv").read_text()

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from jaxpose.cli.fit.candidates import noise_floor
+from jaxpose.datasets.origin import moved
 from jaxpose.datasets.rgbd import euroc
 from jaxpose.datasets.rgbd.imu_csv import read_imu, read_mounting
 from jaxpose.errors import DataError
@@ -66,13 +67,15 @@ def calibrate(config, source: str, trajectory: Trajectory, on_update: OnUpdate) 
     t0 = float(trajectory.t[0])
     t0_ns = trajectory.t0_ns + round(t0 * 1e9)
     imu, sheet, notes = _readings(config.imu, t0_ns)
+    origin = trajectory.T[0, :3, 3]  # poses far from the world's origin are worked on near it
+    near = moved(trajectory.T, -origin)
     sigmas = np.repeat([config.position_sigma, np.radians(config.rotation_sigma_deg)], 3)
     mounting = None if config.extrinsics is None else read_mounting(config.extrinsics)
     on_update(Update(f"estimating {', '.join(config.estimate)} (compiling)"))
     try:
         known = smooth(
             trajectory.t - t0,
-            trajectory.T,
+            near,
             sigmas,
             imu,
             estimate=config.estimate,
@@ -84,7 +87,7 @@ def calibrate(config, source: str, trajectory: Trajectory, on_update: OnUpdate) 
         raise DataError(f"{source}: {error}") from None
     if config.out is not None:
         on_update(Update(f"writing {config.out}"))
-        _write(config.out, known, t0_ns / 10**9)
+        _write(config.out, known, t0_ns / 10**9, origin)
         upright = ", world upright" if "gravity" in config.estimate else ""
         notes.append(f"trajectory with covariance written to {config.out}, metres{upright}")
     if config.kalibr is not None:
@@ -152,7 +155,7 @@ def _readings(path: Path, t0_ns: int) -> tuple[Imu, ImuNoise | None, list[str]]:
     return file.since(t0_ns), None, list(file.notes)
 
 
-def _write(out: Path, known: Posterior, t0: float) -> None:
+def _write(out: Path, known: Posterior, t0: float, origin: Float[np.ndarray, "3"]) -> None:
     field, params = known.field()
     covariance = known.covariances()
     up = np.eye(3)
@@ -164,7 +167,7 @@ def _write(out: Path, known: Posterior, t0: float) -> None:
         out,
         shifted(field, t0),
         params,
-        alignment=Similarity(1.0, up, np.zeros(3)),
+        alignment=Similarity(1.0, up, up @ (known.sensors.scale * origin)),
         covariance=covariance._replace(t=covariance.t + t0),
     )
 

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.distance import pdist
 
+from jaxpose.datasets.origin import far_origin, moved
 from jaxpose.datasets.photos.registry import load_photographs
 from jaxpose.datasets.photos.transforms_json import stated
 from jaxpose.datasets.synthetic import pose_noise
@@ -23,6 +24,7 @@ from jaxpose.geometry import rigid
 Pose = Literal["posenet", "per_frame", "bspline", "spline_reset"]
 Study = Literal["fields", "encoding", "size", "spline", "ablations"]
 ORBIT = Path("orbit")
+_FAR = 100.0  # times the cameras' extent: a world so far from its origin is worked on near it
 _WIDTHS = {"fast": 100, "paper": 400}  # [px]
 _SMOKE_WIDTH, _SMOKE_VIEWS = 24, 8
 
@@ -126,6 +128,7 @@ class Problem(NamedTuple):
     T_start: Float[np.ndarray, "n 4 4"]  # camera-to-world
     extent: float  # largest distance between true cameras [scene units]; NaN where none is known
     metadata: dict[str, Any]  # the data and the noise in words and numbers
+    origin: np.ndarray = np.zeros(3)  # (3,) of the poses' world in that of the data
 
 
 def load(config: Config) -> Problem:
@@ -142,6 +145,8 @@ def load(config: Config) -> Problem:
             f"{config.data}: expected poses for --noise {config.noise}, got none: --noise unknown"
         )
     extent = DIAMETER if config.data == ORBIT else float(pdist(train.T_world_cam[:, :3, 3]).max())
+    origin = far_origin(train.T_world_cam, _FAR * extent)
+    train, held_out = (p._replace(T_world_cam=moved(p.T_world_cam, -origin)) for p in (train, held_out))
     T_start, words = _disturbed(config, train, extent)
     strange = sorted({seen.kind for seen in train.lenses if stated(seen) is None})
     unwritten = [
@@ -156,7 +161,7 @@ def load(config: Config) -> Problem:
         "noise": words,
         "notes": (*train.notes, *unwritten),
     }
-    return Problem(train, held_out, T_start, extent, metadata)
+    return Problem(train, held_out, T_start, extent, metadata, origin)
 
 
 def _photographs(config: Config) -> tuple[Photographs, Photographs]:

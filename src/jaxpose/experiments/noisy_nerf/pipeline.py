@@ -18,6 +18,7 @@ import imageio.v3 as imageio
 import numpy as np
 from jaxtyping import Float
 
+from jaxpose.datasets.origin import moved
 from jaxpose.datasets.photos import blender
 from jaxpose.datasets.photos.lens import as_camera
 from jaxpose.datasets.photos.registry import find_format, images_folder
@@ -155,7 +156,8 @@ def _single(
     on_update(Update("drawing figures"))
     _draw(folder, config, problem, measured, trained)
     _write_poses(folder, config, problem, measured)
-    save(folder / "field.npz", model.field, trained.state.pose, alignment=measured.alignment)
+    to_data = measured.alignment._replace(translation=measured.alignment.translation + problem.origin)
+    save(folder / "field.npz", model.field, trained.state.pose, alignment=to_data)
     results = training_loop.results_of(
         "noisy_nerf",
         config,
@@ -200,16 +202,15 @@ def _draw(folder: Path, config: Config, problem: Problem, measured: Measured, tr
 def _write_poses(folder: Path, config: Config, problem: Problem, measured: Measured) -> None:
     """The refined poses, aligned with the data's own world, as a trajectory and as transforms.json."""
     photographs = problem.train
-    refined = photographs._replace(T_world_cam=measured.T_estimate)
-    trajectories.write_tum(
-        folder / "trajectory.txt", trajectories.Trajectory(photographs.t, measured.T_estimate)
-    )
+    in_data = lambda T: moved(T, problem.origin)
+    refined = photographs._replace(T_world_cam=in_data(measured.T_estimate))
+    poses = {"trajectory.txt": measured.T_estimate}
     if measured.posed:
-        trajectories.write_tum(
-            folder / "reference.txt", trajectories.Trajectory(photographs.t, photographs.T_world_cam)
-        )
+        poses["reference.txt"] = photographs.T_world_cam
+    for name, T in poses.items():
+        trajectories.write_tum(folder / name, trajectories.Trajectory(photographs.t, in_data(T)))
     with atomic.atomic(folder / "start.npz") as temporary:
-        np.savez(temporary, t=photographs.t, T_world_cam=problem.T_start)
+        np.savez(temporary, t=photographs.t, T_world_cam=in_data(problem.T_start))
     images = "." if config.data == ORBIT else images_folder(config.data).resolve()
     # The camera of the run is that of the files only where they were not brought to another.
     own = len(set(photographs.lenses)) == 1 and as_camera(photographs.lenses[0]) is not None

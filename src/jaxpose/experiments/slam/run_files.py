@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from jaxpose.datasets.origin import moved
 from jaxpose.datasets.types import Recording
 from jaxpose.experiments.progress import OnUpdate, Update
 from jaxpose.experiments.slam.calibration import calibration_numbers
@@ -26,6 +27,7 @@ from jaxpose.fields import save
 from jaxpose.files import atomic, trajectories
 from jaxpose.files.camera_json import write_camera
 from jaxpose.files.ply import write_ply
+from jaxpose.geometry.rigid import Similarity
 from jaxpose.plots import slam as slam_plots
 from jaxpose.slam import SlamResult
 from jaxpose.slam.initial_pose import first_pose
@@ -53,7 +55,7 @@ def write_run(
     on_update(Update("measuring the trajectory"))
     errors = None if ground_truth is None else accuracy(result, recording.t, ground_truth)
     measured = Measured(errors, inertial(recording, result), freedom(recording, result))
-    _write_trajectory(folder, recording, result)
+    _write_trajectory(folder, source, result)
     on_update(Update("writing the map"))
     write_map(folder / "map.npz", SavedMap(result.map_config, *result.scene_params, result.keyframes))
     images_folder = "." if options.data is None else options.data.resolve()
@@ -71,14 +73,16 @@ def write_run(
     return found, np.full(len(recording.t), np.nan) if errors is None else errors.translation_m
 
 
-def _write_trajectory(folder: Path, recording: Recording, result: SlamResult) -> None:
-    """The poses of the frames, the ground truth, and the continuous trajectory."""
-    t, ground_truth = recording.t, recording.T_world_cam
-    trajectories.write_tum(folder / "trajectory.txt", trajectories.Trajectory(t, result.T_world_cam))
+def _write_trajectory(folder: Path, source: Source, result: SlamResult) -> None:
+    """The poses of the frames, the ground truth, and the continuous trajectory, in the world of the files."""
+    t, ground_truth, origin = source.recording.t, source.recording.T_world_cam, source.origin
+    in_files = lambda T: trajectories.Trajectory(t, moved(T, origin))
+    trajectories.write_tum(folder / "trajectory.txt", in_files(result.T_world_cam))
     if ground_truth is not None:
-        trajectories.write_tum(folder / "reference.txt", trajectories.Trajectory(t, ground_truth))
+        trajectories.write_tum(folder / "reference.txt", in_files(ground_truth))
     known = None if result.posterior is None else result.posterior.covariances()
-    save(folder / "field.npz", result.field, result.field_params, covariance=known)
+    alignment = Similarity(1.0, np.eye(3), origin) if origin.any() else None
+    save(folder / "field.npz", result.field, result.field_params, alignment=alignment, covariance=known)
 
 
 def _write_surface(folder: Path, recording: Recording, result: SlamResult) -> tuple[str, ...]:

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from jaxpose.datasets.origin import far_origin, moved
 from jaxpose.datasets.rgbd import registry as rgbd_registry
 from jaxpose.datasets.rgbd.imu_csv import imu_notes, with_imu
 from jaxpose.datasets.synthetic import room
@@ -20,6 +21,7 @@ from jaxpose.slam.initial_pose import first_force, is_gravity
 
 SIMULATED_HZ = 200.0  # of the IMU made for recordings that have none
 _RECORDED_HZ = 30.0  # frame rate of recordings that have no timestamps and say nothing
+_FAR_M = 1e3  # float32 holds 0.06 mm there
 _POSE_NOISE = PoseNoise(1e-3, 2e-3)  # [m, rad] what motion capture is good for
 
 
@@ -29,6 +31,7 @@ class Source(NamedTuple):
     recording: Recording
     metadata: dict[str, Any]
     imu: str  # where the inertial readings come from
+    origin: np.ndarray = np.zeros(3)  # (3,) [m] of the recording's world in that of its files
 
 
 def load(options: Options) -> Source:
@@ -75,7 +78,7 @@ def load(options: Options) -> Source:
         option = "--imu-filter" if options.imu_filter else "--imu-offset-s"
         raise DataError(f"{recording.name}: {option} expected a recording with its own IMU, got none")
     recorded = len(recording.t)
-    recording = _cut(recording, options)
+    recording, origin = _near_origin(_cut(recording, options))
     if own_imu:
         _check_gravity(recording, options)
     metadata = {
@@ -87,7 +90,18 @@ def load(options: Options) -> Source:
         "rate_hz": 1 / float(np.median(np.diff(recording.t))),
         "size": (recording.camera.width, recording.camera.height),
     }
-    return Source(prefetch(recording), metadata, imu)
+    return Source(prefetch(recording), metadata, imu, origin)
+
+
+def _near_origin(recording: Recording) -> tuple[Recording, np.ndarray]:
+    """The recording in a world whose origin float32 can work at, and where that is in its files."""
+    origin = far_origin(recording.T_world_cam, _FAR_M)
+    if recording.T_world_cam is None or not origin.any():
+        return recording, origin
+    at = " ".join(f"{x:.0f}" for x in origin)
+    note = f"map.npz, points.ply and mesh.ply are relative to {at}, as float32 has not the digits"
+    near = moved(recording.T_world_cam, -origin)
+    return recording._replace(T_world_cam=near, notes=(*recording.notes, note)), origin
 
 
 def _sheet(noise: ImuNoise) -> str:
