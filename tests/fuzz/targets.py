@@ -355,6 +355,12 @@ def _of(name: str, read: Callable[[Path], Any]) -> Callable[[Path], Any]:
     return lambda folder: read(folder / name)
 
 
+def _points(folder: Path) -> np.ndarray:
+    """Points of a scan, less those with NaN, which its reader leaves out and counts."""
+    points = ply.read_points(folder / "a.ply")
+    return points[np.isfinite(points).all(1)]
+
+
 def _unseen(read: Callable[[Path], Any]) -> Callable[[Path], Any]:
     """A reader whose result may hold NaN."""
     return lambda folder: read(folder) and None
@@ -397,8 +403,8 @@ TARGETS = {
     "llff": Target(_llff, partial(_photographs, llff.load)),
     "colmap_text": Target(partial(_colmap, True), _read_colmap),
     "colmap_binary": Target(partial(_colmap, False), _read_colmap),
-    "ply_text": Target(partial(_ply, True), _of("a.ply", ply.read_points)),
-    "ply_binary": Target(partial(_ply, False), _of("a.ply", ply.read_points)),
+    "ply_text": Target(partial(_ply, True), _points),
+    "ply_binary": Target(partial(_ply, False), _points),
     "tum_file": Target(_tum_file, _of("a.txt", trajectories.read_tum)),
     "euroc_file": Target(_euroc_file, _of("a.txt", trajectories.read_euroc)),
     "kitti_file": Target(_kitti_file, _of("a.txt", trajectories.read_kitti)),

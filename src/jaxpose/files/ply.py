@@ -75,7 +75,7 @@ def read_points(path: Path | str) -> Float[np.ndarray, "n 3"]:
         if there < count:
             raise DataError(f"{path}: expected {count} vertices, got {there}")
         vertices = np.fromfile(stream, kind, count)
-        return _finite(path, np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1))
+        return _near(path, np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1))
 
 
 def write_ply(
@@ -170,11 +170,12 @@ def _text(
         ) from None
     if len(points) != count:
         raise DataError(f"{path}: expected {count} vertices, got {len(points)}")
-    return _finite(path, points)
+    return _near(path, points)
 
 
-def _finite(path: Path, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """The points; DataError for NaN, infinity and what is too far."""
-    for row in np.flatnonzero(~(np.abs(points) <= FARTHEST_M).all(1)):
+def _near(path: Path, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """The points, those with NaN or infinity as they are; DataError for what is too far."""
+    known = np.isfinite(points).all(1)
+    for row in np.flatnonzero(known & ~(np.abs(points) <= FARTHEST_M).all(1)):
         raise DataError(f"{path}: expected points up to {FARTHEST_M:g} m away, got {points[row]}")
     return points
