@@ -76,7 +76,7 @@ def test_lost_frames_lead_to_where_the_camera_is_found():
 def test_of_two_poses_that_fit_the_surfaces_colour_decides():
     found = Tracked(
         np.eye(4), None, 1.0, 1.0, colour_error=0.1, exposure=np.ones(3), valid=0.9, iterations=5, sigma=0.0,
-        information=np.zeros((6, 6)),
+        information=np.zeros((6, 6)), line_delay=np.zeros(2),
     )  # fmt: skip
     better = found._replace(colour_error=0.03)
     assert _looks_better(POLICY, better, found) and not _looks_better(POLICY, found, better)

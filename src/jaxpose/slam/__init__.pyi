@@ -7,6 +7,7 @@ from .config import MapConfig as MapConfig
 from .config import RecoveryConfig as RecoveryConfig
 from .config import SlamConfig as SlamConfig
 from .config import TrackConfig as TrackConfig
+from .line_delay import estimate_line_delay as estimate_line_delay
 from .pipeline import Progress as Progress
 from .pipeline import SlamResult as SlamResult
 from .pipeline import finish as finish

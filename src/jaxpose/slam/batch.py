@@ -98,7 +98,7 @@ def estimate_trajectory(state: SlamState, imu: Imu | None) -> Posterior | None:
         np.repeat(sigma[kept], 3, axis=1),
         imu._replace(t=np.asarray(imu.t, np.float64) - t0),
         use=use.get(config.imu, ("gyroscope",)),
-        estimate=("biases", "gravity", *config.estimate),
+        estimate=("biases", "gravity", *(x for x in config.estimate if x != "line-delay")),
         noise=config.imu_noise,
         T_body_cam=state.T_body_cam,
         gravity_world=state.gravity_world,

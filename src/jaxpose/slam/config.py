@@ -142,8 +142,11 @@ class SlamConfig:
     frame: FrameName = "anchored"
     # Sparse features as a second opinion on the motion (`gauss_newton` only): ORB by OpenCV, or none.
     features: Literal["orb", "none"] = "orb"
-    # What the final pass over a run with an IMU finds beside biases and gravity: time offset, T_body_cam.
-    estimate: tuple[Literal["offset", "extrinsics"], ...] = ()
+    # offset, extrinsics: by the final pass over a run with an IMU, beside biases and gravity; line-delay: by
+    # three runs before it.
+    estimate: tuple[Literal["offset", "extrinsics", "line-delay"], ...] = ()
+    # From row to row of a rolling shutter [us]; a frame's time is its first row's.
+    line_delay_us: float = 0.0
     seed: int = 0  # of the network's start, the pixels drawn, the noise of a simulated IMU
     field: PoseNetConfig = PoseNetConfig(layers=4, width=128, activation="softplus")
     track: TrackConfig = TrackConfig()
@@ -158,6 +161,8 @@ class SlamConfig:
     def __post_init__(self):
         if self.hold_out == 1 or self.hold_out < 0:
             raise ValueError(f"hold_out: expected 0, or 2 or more, got {self.hold_out}")
+        if not math.isfinite(self.line_delay_us):
+            raise ValueError(f"line_delay_us: expected a number, got {self.line_delay_us}")
         if self.voxel is not None and not 0 < self.voxel < math.inf:
             raise ValueError(f"voxel: expected a positive number, got {self.voxel}")
 

@@ -21,22 +21,22 @@ from jaxpose.geometry import rigid
 from jaxpose.geometry.camera import Camera, angle_of_view
 from jaxpose.imu import GRAVITY_WORLD, Gravity, Imu
 from jaxpose.scenes import SceneField
-from jaxpose.scenes.voxel_blocks import BlockConfig, Blocks, blocks_of_grid, voxel_blocks
+from jaxpose.scenes.voxel_blocks import BlockConfig, Blocks, voxel_blocks
 from jaxpose.slam.batch import all_readings, final_trajectory
 from jaxpose.slam.config import SlamConfig
 from jaxpose.slam.initial_pose import first_pose, upright_pose
 from jaxpose.slam.keyframes import FrameReader, keyframe_images, thumbnail
 from jaxpose.slam.map.backend import (
+    as_blocks,
     framed_field,
     grow_to_fit,
     is_mapped,
     map_frame,
-    scene_params,
     seen_points,
 )
 from jaxpose.slam.map.texture import Texture, make_texture, textured
 from jaxpose.slam.observation import to_device
-from jaxpose.slam.tracker import next_pose
+from jaxpose.slam.tracker import next_pose, unrolled
 from jaxpose.slam.tracking.features import detect
 from jaxpose.slam.tracking.intrinsic_frame import is_due, make_refit, window
 from jaxpose.slam.tracking.predict import GYRO_BIAS_SIGMA
@@ -101,8 +101,8 @@ def init(
     Raises:
         ValueError: for a pose that is no rigid transform, or a frame of reference without a duration.
     """
-    rigid = {"T_world_cam": T_world_cam, "T_body_cam": T_body_cam}
-    poses = {name: None if T is None else _rigid(name, T) for name, T in rigid.items()}
+    given = {"T_world_cam": T_world_cam, "T_body_cam": T_body_cam}
+    poses = {name: None if T is None else _rigid(name, T) for name, T in given.items()}
     if config.uses_field and config.frame != "anchored" and duration_s is None:
         raise ValueError(f"slam.init: frame {config.frame} expected duration_s [s] of the sequence, got None")
     framed = framed_field(config)
@@ -204,7 +204,17 @@ def run(
         DataError: where the recording cannot be tracked: fewer than two frames, no depth in the first, an IMU
             asked for and not there.
     """
-    state = begin(recording, config) if state is None else state
+    return _finish(track_all(recording, config, on_frame, state), recording.read, recording.imu)
+
+
+def track_all(
+    recording: Recording,
+    config: SlamConfig,
+    on_frame: Callable[[Progress], None] | None = None,
+    state: SlamState | None = None,
+) -> SlamState:
+    """Track and map every frame: `run` without its end, with the same arguments and errors."""
+    state = state or begin(recording, config)
     for i in range(state.frames.count, len(recording.t)):
         started, t = time.perf_counter(), float(recording.t[i])
         readings = _readings_until(recording.imu, state.frames.t[-1] if i else -np.inf, t)
@@ -220,7 +230,7 @@ def run(
         state = state._replace(frames=state.frames.put(i, seconds=time.perf_counter() - started))
         if on_frame is not None:
             on_frame(Progress(i, len(recording.t), state, _ground_truth_error(recording, state)))
-    return _finish(state, recording.read, recording.imu)
+    return state
 
 
 def begin(recording: Recording, config: SlamConfig = _DEFAULT) -> SlamState:
@@ -255,6 +265,7 @@ def _advance(state: SlamState, frame: Frame, t: float, imu: Imu | None, read: Fr
     generator = np.random.default_rng([config.seed, i])
     track_key, map_key = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), i))
     state = state._replace(frames=state.frames.appended(t), imu=_joined(state, imu))
+    frame = unrolled(state, frame)
     image = to_device(frame)._replace(exposure=state.exposure)
     features = detect(frame, state.camera) if config.uses_features else None
     state = next_pose(state, frame, image, features, generator, track_key) if i else _first_pose(state)
@@ -309,13 +320,14 @@ def _refit(camera: Camera, config: SlamConfig):
 
 def _finish(state: SlamState, read: FrameReader, imu: Imu | None) -> SlamResult:
     """One continuous trajectory, by all readings or else through all poses, and the map with its texture."""
-    if state.frames.count < 2:
-        raise DataError(f"SLAM: expected at least 2 frames, got {state.frames.count}")
-    if state.config.frame == "intrinsic" and not is_due(state.frames.count - 1):
+    count = state.frames.count
+    if count < 2:
+        raise DataError(f"SLAM: expected at least 2 frames, got {count}")
+    if state.config.frame == "intrinsic" and not is_due(count - 1):
         state = _update_intrinsic_frame(state)
     frames, found = state.frames, final_trajectory(state, imu)
     tracked = frames.T_world_body @ state.T_body_cam
-    config, blocks = _as_blocks(state)
+    config, blocks = as_blocks(state)
     keyframes = keyframe_images(read, np.flatnonzero(frames.keyframe), tracked)
     texture = make_texture(config, blocks, keyframes, state.camera)
     return SlamResult(
@@ -325,16 +337,6 @@ def _finish(state: SlamState, read: FrameReader, imu: Imu | None) -> SlamResult:
         scene_params=(blocks, jax.tree.map(jnp.asarray, texture)),
         **found._asdict(),
     )
-
-
-def _as_blocks(state: SlamState) -> tuple[BlockConfig, Blocks]:
-    """The map as blocks, which is what the method `fused` keeps anyway."""
-    assert state.grid is not None and state.map is not None
-    params = scene_params(state.map)
-    if isinstance(state.grid, BlockConfig):
-        return state.grid, params
-    (values,) = params
-    return blocks_of_grid(state.grid, np.asarray(values))
 
 
 def _joined(state: SlamState, imu: Imu | None) -> Imu | None:

@@ -11,6 +11,7 @@ from jaxpose.slam.config import RecoveryConfig
 from jaxpose.slam.keyframes import unlikeness
 from jaxpose.slam.map.backend import map_backend, scene_params
 from jaxpose.slam.observation import Image, is_blank
+from jaxpose.slam.rolling_shutter import at_first_row
 from jaxpose.slam.tracking.feature_pose import feature_nis, seen_pose, with_features
 from jaxpose.slam.tracking.features import Features
 from jaxpose.slam.tracking.predict import (
@@ -83,6 +84,14 @@ def next_pose(
     return _update_state(state, frames, predicted, by_motion, tracked, status)
 
 
+def unrolled(state: SlamState, frame: Frame) -> Frame:
+    """The state's last frame, all of it at its first row's time, by the speed that is expected there."""
+    if state.config.line_delay_us == 0 or state.frames.count < 2:
+        return frame
+    twist_cam = rigid.adjoint(rigid.inverse(state.T_body_cam)) @ _predict(state).twist
+    return at_first_row(frame, state.camera, twist_cam, state.config.line_delay_us / 1e6)
+
+
 def _predict(state: SlamState) -> MotionPrediction:
     """The motion by constant velocity or by the readings, and how far off [m, rad] it may be."""
     config, frames, motion = state.config, state.frames, state.motion
@@ -127,7 +136,7 @@ def _update_state(
     T_world_body[:3, :3] = rigid.nearest_rotation(T_world_body[:3, :3])  # float32 adds up
     values = {"T_world_body": T_world_body, "status": status}
     if tracked is not None:
-        names = ("iterations", "loss", "depth_error", "colour_error", "valid", "sigma")
+        names = ("iterations", "loss", "depth_error", "colour_error", "valid", "sigma", "line_delay")
         values |= {name: getattr(tracked, name) for name in names}
     sure = registered is not None and status <= TrackingStatus.WEAK and frames.last_found == i - 1
     fade = np.exp(-dt / config.recovery.fading_s) if status == TrackingStatus.LOST else 1.0
@@ -266,6 +275,7 @@ def _problem(
         jax.tree.map(as_float, imu_sigmas(config.imu_noise, imu, predicted.dt)),
         as_float(T_world_body[last]),
         as_float(state.T_body_cam),
+        as_float(rigid.adjoint(rigid.inverse(state.T_body_cam)) @ predicted.twist),
         where,
     )
 

@@ -42,6 +42,7 @@ class Frames(NamedTuple):
     T_inner: Float[np.ndarray, "n 4 4"]  # motion since the last frame, in the frame `intrinsic`
     status: Int8[np.ndarray, " n"]  # TrackingStatus
     feature_nis: Float[np.ndarray, " n"]  # squared Mahalanobis distance from the pose by features
+    line_delay: Float[np.ndarray, "n 2"]  # correction [s] by the image, and its information
     mapped: Bool[np.ndarray, " n"]  # the map was made from it
     keyframe: Bool[np.ndarray, " n"]
     iterations: Int[np.ndarray, " n"]
@@ -108,6 +109,7 @@ def no_frames(t: Float[np.ndarray, " n"]) -> Frames:
         T_inner=np.full((count, 4, 4), np.nan),
         status=np.zeros(count, np.int8),
         feature_nis=unknown,
+        line_delay=np.full((count, 2), np.nan),
         mapped=no,
         keyframe=no,
         iterations=np.zeros(count, int),

@@ -38,7 +38,11 @@ class RoomConfig:
     # steps, two cameras, the phase of light, or points of a coarser camera that are carried over to colour.
     sensor: Sensor = "axial"
     depth_noise: float = 1.0  # times the sensor's random noise; 0 with axial is exact depth
+    line_delay_us: float = (
+        0.0  # [us] of a rolling shutter, from row to row; a frame's time is its first row's
+    )
     holes: bool = True  # no depth on what defeats the sensor: shadows, grazing, dark or plain surfaces
+    line_delay_us: float = 0.0  # [us] from row to row of a rolling shutter; a frame's time is its first row's
     imu_noise: ImuNoise = ADIS16448
     gravity_world: tuple[float, float, float] = GRAVITY_WORLD  # [m/s^2] z is up
     # A EuRoC sequence whose recorded motion and IMU take the place of the walk and of `imu_*`.
@@ -48,7 +52,7 @@ class RoomConfig:
         for name in ("duration_s", "rate_hz", "imu_rate_hz", "width", "height", "speed"):
             if not 0 < getattr(self, name) < np.inf:
                 raise ValueError(f"RoomConfig.{name}: expected a positive number, got {getattr(self, name)}")
-        for name in ("seed", "depth_noise"):
+        for name in ("seed", "depth_noise", "line_delay_us"):
             if not 0 <= getattr(self, name) < np.inf:
                 raise ValueError(f"RoomConfig.{name}: expected zero or more, got {getattr(self, name)}")
         if self.sensor not in RANGES:
@@ -76,10 +80,17 @@ def room(config: RoomConfig = RoomConfig()) -> Recording:
     centre = (config.width - 1) / 2, (config.height - 1) / 2
     camera = Camera(focal, focal, *centre, config.width, config.height)
     T_world_cam = drive.T_world_body @ drive.T_body_cam
+    half_rows = np.arange(2 * config.height + 1) / 2 - 0.5  # their edges and centres
 
     @lru_cache(maxsize=128)
     def read(i: int) -> Frame:
-        rgb, depth, cosine = jax.device_get(render(camera, shapes, atlas, np.float32(T_world_cam[i])))
+        at = T_world_cam[i]
+        if config.line_delay_us > 0:
+            at = (
+                drive.pose(drive.t[i] + np.maximum(half_rows, 0) * config.line_delay_us / 1e6)
+                @ drive.T_body_cam
+            )
+        rgb, depth, cosine = jax.device_get(render(camera, shapes, atlas, np.float32(at)))
         depth = measured_depth(
             config.sensor, depth, rgb, cosine, camera, np.random.default_rng([config.seed, i]),
             noise=config.depth_noise, holes=config.holes,
@@ -112,22 +123,31 @@ def _drive(config: RoomConfig) -> Motion:
 
 @partial(jax.jit, static_argnums=0)
 def render(
-    camera: Camera, shapes: Shapes, atlas: Atlas, T_world_cam: Float[Array, "4 4"]
+    camera: Camera,
+    shapes: Shapes,
+    atlas: Atlas,
+    T_world_cam: Float[Array, "4 4"] | Float[Array, "k 4 4"],
 ) -> tuple[UInt8[Array, "h w 3"], Float[Array, "h w"], Float[Array, "h w"]]:
     """Colour, depth [m] at pixel centres, and the cosine of incidence there.
 
-    Colour mixes the centre of a pixel (one half) with its four corners, which neighbours share.
+    Colour mixes the centre of a pixel (one half) with its four corners, which neighbours share. The pose is
+    the image's, or one for every edge and centre of its rows.
     """
     h, w = camera.height, camera.width
     coordinates = lambda n, first: jnp.arange(n, dtype=jnp.float32) + jnp.float32(first)
     centres = jnp.stack(jnp.meshgrid(coordinates(w, 0), coordinates(h, 0)), -1).reshape(-1, 2)
     corners = jnp.stack(jnp.meshgrid(coordinates(w + 1, -0.5), coordinates(h + 1, -0.5)), -1).reshape(-1, 2)
-    x, y, z = unproject(camera, jnp.concatenate([centres, corners])).T
-    right, down, forwards, eye = T_world_cam[:3].T
+    pixels = jnp.concatenate([centres, corners])
+    x, y, z = unproject(camera, pixels).T
+    T = T_world_cam.reshape(-1, 4, 4)
+    of_ray = T[jnp.minimum(2 * pixels[:, 1] + 1, len(T) - 1).astype(int)] if len(T) > 1 else T
+    right, down, forwards, eye = jnp.moveaxis(of_ray[:, :3], 0, -1).swapaxes(0, 1)
     ray = tuple(right[k] * x + down[k] * y + forwards[k] * z for k in range(3))
-    origin = tuple(eye[:, None])
+    origin = tuple(jnp.broadcast_to(eye, (3, eye.shape[1])))
 
-    seen = within_cone(shapes, eye, forwards, 1 / jnp.sqrt(jnp.max(x * x + y * y) + 1))
+    widest = 1 / jnp.sqrt(jnp.max(x * x + y * y) + 1)
+    some = T[jnp.array([0, len(T) // 2, len(T) - 1])]
+    seen = jax.vmap(lambda T: within_cone(shapes, T[:3, 3], T[:3, 2], widest))(some).any(axis=0)
     hit = locate(shapes, origin, ray, *cast(shapes, origin, ray, seen=seen))
     # the spacing of samples on the surface; stretched by slant, though not by as much as along the slant
     footprint = 0.7 / camera.fx * hit.distance / jnp.sqrt(jnp.maximum(hit.cosine, 0.05))

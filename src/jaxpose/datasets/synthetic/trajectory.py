@@ -1,5 +1,6 @@
 """What moves the camera through the room: a made-up hand, or the recorded motion of a real machine."""
 
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -38,6 +39,7 @@ class Motion(NamedTuple):
     imu: Imu  # on the clock of `t`
     T_body_cam: Float[np.ndarray, "4 4"]
     room: Extent
+    pose: Callable[[Float[np.ndarray, " m"]], Float[np.ndarray, "m 4 4"]]  # T_world_body at times [s]
     notes: tuple[str, ...] = ()
 
 
@@ -58,7 +60,17 @@ def by_hand(
         T_world_body, imu = np.asarray(T_world_body), Imu(*(np.array(x) for x in imu))
     # From right, down, forwards to forwards, left, up, not quite.
     turn = rigid.so3_exp(np.array(_MOUNTING)) @ [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
-    return Motion("room", t, T_world_body, imu, rigid.make(turn, np.array(_LEVER_ARM)), SIZE)
+
+    def pose(times):
+        with jax.enable_x64(True):
+            return np.asarray(_poses(walk, jnp.asarray(times)))
+
+    return Motion("room", t, T_world_body, imu, rigid.make(turn, np.array(_LEVER_ARM)), SIZE, pose)
+
+
+@jax.jit
+def _poses(walk, times):
+    return jax.vmap(partial(hand_held.pose, walk))(times)
 
 
 @partial(jax.jit, static_argnames=("noise", "gravity_world"))
@@ -84,13 +96,15 @@ def recorded(folder: Path | str, duration_s: float, rate_hz: float) -> Motion:
         raise DataError(
             f"{folder}: expected two frames at {rate_hz:g} Hz within IMU and ground truth, got {len(t)}"
         )
-    T_world_body = poses_at(Trajectory(ground_truth.t, ground_truth.T_world_body), t)
+    path = Trajectory(ground_truth.t, ground_truth.T_world_body)
+    T_world_body = poses_at(path, t)
     if np.isnan(T_world_body).any():
         raise DataError(f"{folder}: expected ground truth without gaps above 0.1 s, found one")
     lower, upper = (f(T_world_body[:, :3, 3], axis=0) for f in (np.min, np.max))
     if lower[2] < 0.05:
         raise DataError(f"{folder}: expected a motion above the floor (z = 0), got z = {lower[2]:.2f} m")
-    T_world_body[:, :2, 3] -= (lower + upper)[:2] / 2
+    middle = np.append((lower + upper)[:2] / 2, 0.0)
+    T_world_body[:, :3, 3] -= middle
     wide, deep = upper[:2] - lower[:2] + 2 * _AROUND
     room = float(max(wide, SIZE[0])), float(max(deep, SIZE[1])), float(max(upper[2] + _ABOVE, SIZE[2]))
     name = folder.resolve().parent.name if folder.resolve().name == "mav0" else folder.resolve().name
@@ -108,5 +122,6 @@ def recorded(folder: Path | str, duration_s: float, rate_hz: float) -> Motion:
         imu,
         read_camera_sheet(sheet)[1] if sheet.exists() else own,
         room,
+        lambda times: rigid.make(np.eye(3), -middle) @ poses_at(path, np.minimum(times, last)),
         (what,),
     )

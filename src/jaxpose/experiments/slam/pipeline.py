@@ -24,7 +24,7 @@ from jaxpose.experiments.slam.run_files import write_run
 from jaxpose.experiments.slam.source import Source, load
 from jaxpose.files import atomic, run_folder, trajectories
 from jaxpose.plots import slam as slam_plots
-from jaxpose.slam import ImuMode, Progress
+from jaxpose.slam import ImuMode, Progress, estimate_line_delay
 from jaxpose.slam.checkpoint import load as load_checkpoint
 from jaxpose.slam.pipeline import run as track
 
@@ -114,6 +114,15 @@ def _single(
     config, state = slam_config(options), None
     if checkpoint.exists():
         state = load_checkpoint(checkpoint, recording, config)
+    line_delay = {}
+    if "line-delay" in config.estimate:
+        found = estimate_line_delay(
+            recording, config, lambda p: on_update(tracking_update(f"{mode}, for the line delay", p))
+        )
+        config = replace(
+            config, line_delay_us=found.line_delay_us, estimate=tuple(set(config.estimate) - {"line-delay"})
+        )
+        line_delay = {"line_delay": found._asdict()}
     keep = checkpoint_callback(folder, recording, settings)
 
     def on_frame(progress: Progress) -> None:
@@ -131,6 +140,7 @@ def _single(
         "reference_frame": options.slam.frame,
         "seed": options.slam.seed,
         "smoke": options.smoke,
+        **line_delay,
         **found,
         **cost(started),
     }

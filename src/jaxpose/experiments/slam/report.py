@@ -8,16 +8,16 @@ from typing import Any
 from jaxpose.experiments.outcome import SMOKE, cost_text, markdown_table
 from jaxpose.experiments.progress import Update
 from jaxpose.experiments.slam.calibration import calibration_lines
-from jaxpose.slam import ImuMode, Progress
+from jaxpose.slam import Progress
 
 _COLUMNS: tuple[str, ...] = ("IMU", "ATE [cm]", "RPE [cm]", "RPE [deg]", "frames lost", "s / frame")
 
 
-def tracking_update(mode: ImuMode, progress: Progress) -> Update:
+def tracking_update(mode: str, progress: Progress) -> Update:
     """How far tracking is, in words.
 
     Args:
-        mode: of the IMU.
+        mode: of the IMU, and what the run is for.
         progress: the frame that was tracked.
 
     Returns:
@@ -83,6 +83,11 @@ def report(folder: Path, results: dict[str, Any]) -> str:
             "RMSE to the tracked poses",
         ),
     ]
+    if "line_delay" in results:
+        found = results["line_delay"]
+        lines.append(
+            _line("line delay", f"{found['line_delay_us']:.1f} +- {found['sigma_us']:.1f} us from row to row")
+        )
     if "calibration" in results:
         lines += [_line(*line) for line in calibration_lines(results["calibration"])]
     if "degrees_of_freedom" in results:

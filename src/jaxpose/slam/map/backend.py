@@ -15,7 +15,7 @@ from jaxpose.geometry import rigid
 from jaxpose.geometry.camera import Camera, angle_of_view, pixel_grid, unproject_numpy
 from jaxpose.scenes import GridConfig, SceneField, bounding_grid, grid, grow, merge
 from jaxpose.scenes.types import Params
-from jaxpose.scenes.voxel_blocks import BlockConfig, empty_blocks, voxel_blocks
+from jaxpose.scenes.voxel_blocks import BlockConfig, Blocks, blocks_of_grid, empty_blocks, voxel_blocks
 from jaxpose.slam.config import IMU_WEIGHTS, ImuWeights, MapConfig, SlamConfig, TrackConfig
 from jaxpose.slam.keyframes import FrameReader, choose, keyframe_images, overlap
 from jaxpose.slam.map.integrate import MapSample, grown_map, make_integrate, sample_map
@@ -63,7 +63,8 @@ def map_backend(state: SlamState) -> MapBackend:
     assert size is not None
     framed = framed_field(config)
     weights = IMU_WEIGHTS[config.imu] if config.track.method == "gradient" else IMU_WEIGHTS["none"]
-    return _map_backend(state.camera, config.track, config.map, framed, weights, size)
+    line_delay = "line-delay" in config.estimate
+    return _map_backend(state.camera, config.track, config.map, framed, weights, size, line_delay)
 
 
 def framed_field(config: SlamConfig) -> FramedField | None:
@@ -82,6 +83,7 @@ def _map_backend(
     framed: FramedField | None,
     weights: ImuWeights,
     size: BlockConfig | GridConfig,
+    line_delay: bool,
 ) -> MapBackend:
     scale = {"band": size.truncation, "width": size.truncation / 8}
     if isinstance(size, BlockConfig):
@@ -95,7 +97,7 @@ def _map_backend(
         sample = partial(_sample_grid, scene, size)
     track = replace(track, sample=replace(track.sample, **scale))
     if track.method == "gauss_newton":
-        step = make_register(sample, camera, track)
+        step = make_register(sample, camera, track, line_delay=line_delay)
     else:
         assert framed is not None
         step = make_gradient(scene, framed, camera, track, weights)
@@ -217,3 +219,13 @@ def map_frame(
         )
     is_new = not len(kept) or shares.max() < config.keyframe_overlap
     return state._replace(map=updated, frames=frames.put(i, mapped=True, keyframe=is_new))
+
+
+def as_blocks(state: SlamState) -> tuple[BlockConfig, Blocks]:
+    """The map as blocks, which is what the method `fused` keeps anyway."""
+    assert state.grid is not None and state.map is not None
+    params = scene_params(state.map)
+    if isinstance(state.grid, BlockConfig):
+        return state.grid, params
+    (values,) = params
+    return blocks_of_grid(state.grid, np.asarray(values))

@@ -32,6 +32,12 @@ class MotionPrediction(NamedTuple):
     readings: "PreintegratedImu"
 
     @property
+    def twist(self) -> Float[np.ndarray, "6"]:
+        """Of the body [m/s, rad/s] in its own axes at dt."""
+        (t, later), (T, after) = self.timestamps[-2:], self.T_ref_body[-2:]
+        return rigid.log(rigid.inverse(T) @ after) / (later - t)
+
+    @property
     def sigma(self) -> Float[np.ndarray, "2"]:
         """How far off [m, rad] it may be at dt, along the worst axis."""
         return worst_sigmas(self.covariance)
@@ -49,6 +55,7 @@ class TrackingProblem(NamedTuple):
     imu_sigmas: ResidualSigmas
     T_world_ref: Float[Array, "4 4"]
     T_body_cam: Float[Array, "4 4"]
+    twist_cam: Float[Array, "6"]  # [m/s, rad/s] of the camera in its own axes while the frame is read
     reference_frame: ReferenceFrame
 
 

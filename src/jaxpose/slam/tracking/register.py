@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from jaxpose.fields import Params
 from jaxpose.geometry import se3
-from jaxpose.geometry.camera import Camera
+from jaxpose.geometry.camera import Camera, project
 from jaxpose.losses import weighted_mean
 from jaxpose.slam.config import TrackConfig
 from jaxpose.slam.map.integrate import MapQuery, MapSampler
@@ -43,6 +43,7 @@ class Tracked(NamedTuple):
     iterations: Int[Array, ""]
     sigma: Float[Array, "2"]  # [m, rad] of the pose, by what the image says of it; NaN: not known
     information: Float[Array, "6 6"]  # of the image alone, over right increments of the camera; 0: not known
+    line_delay: Float[Array, "2"]  # correction [s] by the image, its information; NaN: not asked for
 
 
 @runtime_checkable
@@ -185,11 +186,8 @@ def register(
 
     def equations(T):
         found, by = surface_residuals(sample_map, T, pixels, config)
-        residual = jnp.concatenate([found.depth, found.colour.reshape(-1)])
-        slope = jnp.concatenate([by.depth, by.colour.reshape(-1, 6)])
-        w_depth = found.inlier / jnp.maximum(jnp.abs(found.depth), 1)
-        w_colour = config.colour_weight / 3 * found.inlier[:, None] / jnp.maximum(jnp.abs(found.colour), 1)
-        weighted = jnp.concatenate([w_depth, w_colour.reshape(-1)])[:, None] * slope
+        residual, slope, weight = _stacked(found, by, config)
+        weighted = weight[:, None] * slope
         away = se3.log(se3.compose(se3.inverse(T_world_predicted), T))
         expected = _weight(found) * prior
         information = jnp.matmul(weighted.T, slope, precision="highest")
@@ -221,6 +219,45 @@ def register(
     return jax.lax.while_loop(unsettled, improve, (start, jnp.inf))[0]
 
 
+def _stacked(
+    found: Residuals, by: Slopes, config: TrackConfig
+) -> tuple[Float[Array, " m"], Float[Array, "m 6"], Float[Array, " m"]]:
+    """Residuals of depth, then of colour, their derivatives by the pose, and their weights."""
+    residual = jnp.concatenate([found.depth, found.colour.reshape(-1)])
+    slope = jnp.concatenate([by.depth, by.colour.reshape(-1, 6)])
+    w_depth = found.inlier / jnp.maximum(jnp.abs(found.depth), 1)
+    w_colour = config.colour_weight / 3 * found.inlier[:, None] / jnp.maximum(jnp.abs(found.colour), 1)
+    return residual, slope, jnp.concatenate([w_depth, w_colour.reshape(-1)])
+
+
+def line_delay_correction(
+    sample_map: MapSampler,
+    found: Registration,
+    prior: Float[Array, "6 6"],
+    pixels: Pixels,
+    row: Float[Array, " n"],
+    twist_cam: Float[Array, "6"],
+    config: TrackConfig,
+) -> Float[Array, "2"]:
+    """A step of Gauss-Newton on the time from row to row, at a registered pose, whatever that pose may be.
+
+    A row that was read later than thought is moved by the camera's twist for that time.
+
+    Returns:
+        Correction [s] and its information [1/s^2], counted as `_INDEPENDENT` pixels.
+    """
+    at, by = surface_residuals(sample_map, found.T_world_cam, pixels, config)
+    residual, slope, weight = _stacked(at, by, config)
+    rows = jnp.concatenate([row, jnp.repeat(row, 3)])
+    by_delay = jnp.matmul(slope, twist_cam, precision="highest") * rows
+    weighted = weight[:, None] * slope
+    own = jnp.matmul(weighted.T, slope, precision="highest") + _weight(at) * prior
+    shared = jnp.matmul(by_delay, weighted, precision="highest")
+    information = jnp.sum(weight * by_delay**2) - shared @ jnp.linalg.solve(own, shared)
+    correction = -jnp.sum(weight * by_delay * residual) / jnp.maximum(information, 1e-12)
+    return jnp.stack([correction, information / _weight(at)])
+
+
 def pose_sigma(found: Registration, support: Float[Array, "6 6"]) -> Float[Array, "2"]:
     """Standard deviation [m, rad] of an aligned pose along its worst axis, by the image and its features."""
     covariance = jnp.linalg.inv(image_information(found) + support + 1e-6 * jnp.eye(6))
@@ -238,8 +275,10 @@ def _weight(found: Residuals) -> Float[Array, ""]:
     return jnp.maximum(jnp.sum(found.inlier), 1) / _INDEPENDENT
 
 
-def make_register(sample_map: MapQuery, camera: Camera, config: TrackConfig) -> TrackStep:
-    """The compiled `TrackStep` of the method `gauss_newton`."""
+def make_register(
+    sample_map: MapQuery, camera: Camera, config: TrackConfig, *, line_delay: bool = False
+) -> TrackStep:
+    """The compiled `TrackStep` of the method `gauss_newton`, which also asks images for the line delay."""
 
     @jax.jit
     def step(scene_params, fusion_state, params, problem, image, max_depth, key):
@@ -252,6 +291,10 @@ def make_register(sample_map: MapQuery, camera: Camera, config: TrackConfig) -> 
         found = register(sample, start, predicted, problem.covariance, pixels, config)
         T_world_body = se3.compose(found.T_world_cam, se3.inverse(problem.T_body_cam))
         residuals = found.residuals
+        correction = jnp.full(2, jnp.nan)
+        if line_delay:
+            row, prior = project(camera, pixels.direction_cam)[:, 1], jnp.linalg.inv(problem.covariance)
+            correction = line_delay_correction(sample, found, prior, pixels, row, problem.twist_cam, config)
         return Tracked(
             se3.compose(se3.inverse(problem.T_world_ref), T_world_body),
             params,
@@ -263,6 +306,7 @@ def make_register(sample_map: MapQuery, camera: Camera, config: TrackConfig) -> 
             found.iterations,
             pose_sigma(found, problem.support),
             image_information(found),
+            correction,
         )
 
     return step
