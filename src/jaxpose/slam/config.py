@@ -7,6 +7,7 @@ from typing import Literal, NamedTuple
 from jaxpose.fields import PoseNetConfig
 from jaxpose.imu import ADIS16448, ImuNoise
 
+MOST_LINE_DELAY_US = 1000.0  # half a second for an image of 500 rows: no camera is as slow
 ImuMode = Literal["none", "loose", "tight", "accelerometer", "combined"]
 FrameName = Literal["anchored", "default", "world", "random", "intrinsic"]
 
@@ -161,8 +162,10 @@ class SlamConfig:
     def __post_init__(self):
         if self.hold_out == 1 or self.hold_out < 0:
             raise ValueError(f"hold_out: expected 0, or 2 or more, got {self.hold_out}")
-        if not math.isfinite(self.line_delay_us):
-            raise ValueError(f"line_delay_us: expected a number, got {self.line_delay_us}")
+        if not abs(self.line_delay_us) <= MOST_LINE_DELAY_US:
+            raise ValueError(
+                f"line_delay_us: expected at most {MOST_LINE_DELAY_US:g} us, got {self.line_delay_us}"
+            )
         if self.voxel is not None and not 0 < self.voxel < math.inf:
             raise ValueError(f"voxel: expected a positive number, got {self.voxel}")
 

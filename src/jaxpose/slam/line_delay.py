@@ -19,6 +19,7 @@ class LineDelay(NamedTuple):
 
     line_delay_us: float
     sigma_us: float
+    observed: bool  # False: the motion says less of it than that sensors read an image within 1/60 s
 
 
 def estimate_line_delay(
@@ -46,7 +47,8 @@ def estimate_line_delay(
     runs.append(_asked(recording, config, _zero(recording, *runs)[0], on_frame))
     first, second, _ = sorted(runs, key=lambda run: abs(run.correction_s))
     found, slope = _zero(recording, first, second)
-    return LineDelay(1e6 * found, 1e6 * first.sigma_s / abs(slope))
+    sigma = first.sigma_s / abs(slope)
+    return LineDelay(1e6 * found, 1e6 * sigma, sigma < half)
 
 
 class _Asked(NamedTuple):

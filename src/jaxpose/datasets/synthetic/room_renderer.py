@@ -55,6 +55,8 @@ class RoomConfig:
         for name in ("seed", "depth_noise", "line_delay_us"):
             if not 0 <= getattr(self, name) < np.inf:
                 raise ValueError(f"RoomConfig.{name}: expected zero or more, got {getattr(self, name)}")
+        if self.line_delay_us > 1000:
+            raise ValueError(f"RoomConfig.line_delay_us: expected at most 1000 us, got {self.line_delay_us}")
         if self.sensor not in RANGES:
             raise ValueError(f"RoomConfig.sensor: expected one of {', '.join(RANGES)}, got {self.sensor}")
         if self.duration_s * self.rate_hz < 1:

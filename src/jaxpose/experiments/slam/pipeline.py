@@ -119,9 +119,9 @@ def _single(
         found = estimate_line_delay(
             recording, config, lambda p: on_update(tracking_update(f"{mode}, for the line delay", p))
         )
-        config = replace(
-            config, line_delay_us=found.line_delay_us, estimate=tuple(set(config.estimate) - {"line-delay"})
-        )
+        delay = found.line_delay_us if found.observed else config.line_delay_us
+        others = tuple(name for name in config.estimate if name != "line-delay")
+        config = replace(config, line_delay_us=delay, estimate=others)
         line_delay = {"line_delay": found._asdict()}
     keep = checkpoint_callback(folder, recording, settings)
 

@@ -85,9 +85,9 @@ def report(folder: Path, results: dict[str, Any]) -> str:
     ]
     if "line_delay" in results:
         found = results["line_delay"]
-        lines.append(
-            _line("line delay", f"{found['line_delay_us']:.1f} +- {found['sigma_us']:.1f} us from row to row")
-        )
+        text = f"{found['line_delay_us']:.1f} +- {found['sigma_us']:.1f} us  from row to row"
+        unused = "" if found["observed"] else ", not used: this motion says nothing of it"
+        lines.append(_line("line delay", text + unused))
     if "calibration" in results:
         lines += [_line(*line) for line in calibration_lines(results["calibration"])]
     if "degrees_of_freedom" in results:
