@@ -217,7 +217,7 @@ def test_the_last_value_asked_for_is_worked_on():
         go.wait(10)
         done.append(value)
 
-    ask, stop = view_page.latest(work)
+    ask, stop = view_page.latest(work, lambda error: None)
     ask(1.0)
     assert begun.wait(10)
     for value in (2.0, 3.0, 4.0):
@@ -297,7 +297,7 @@ def test_without_the_extra(run, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     monkeypatch.delitem(sys.modules, "jaxpose.cli.view.page")
     monkeypatch.delattr("jaxpose.cli.view.page")
-    assert complaint(run) == 'jaxpose view: expected viser, got none: pip install "jaxpose[viewer]"'
+    assert complaint(run) == 'jaxpose view: expected viser, got none: pip install -e ".[viewer]"'
 
 
 def test_help(capsys):

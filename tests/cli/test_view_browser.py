@@ -24,7 +24,7 @@ PICTURE = "img[src^='blob:'], img[src^='data:image/png']"
 
 @pytest.fixture(scope="module")
 def browser():
-    playwright = pytest.importorskip("playwright.sync_api", reason='needs pip install "jaxpose[viewer-test]"')
+    playwright = pytest.importorskip("playwright.sync_api", reason='needs pip install -e ".[viewer-test]"')
     found = next((path for path in map(shutil.which, BROWSERS) if path), None)
     if found is None:
         pytest.skip(f"needs a browser: none of {', '.join(BROWSERS)} is installed")

@@ -21,7 +21,7 @@ from jaxpose.evaluation import trajectory_error
 from jaxpose.evaluation.consistency import Consistency, aligned_error, consistency, relative_error
 from jaxpose.evaluation.observability import free_rotation
 from jaxpose.evaluation.trajectory_error import Alignment, Statistics
-from jaxpose.experiments.checks import check_finite, check_least, check_positive
+from jaxpose.experiments.checks import check_apart, check_finite, check_least, check_positive
 from jaxpose.experiments.command import Command, execute
 from jaxpose.experiments.outcome import markdown_table
 from jaxpose.experiments.progress import OnUpdate, Update, silent
@@ -68,6 +68,7 @@ class Config:
         check_least(self, max_difference_s=0)
         check_finite(self, "time_offset_s")
         check_positive(self, "rpe_frames", "rpe_seconds", "rpe_metres")
+        check_apart("--plot", self.plot, self.estimate, self.reference)
         if self.plot is not None and self.plot.suffix != ".png":
             raise ValueError(f"--plot: expected a name that ends in .png, got {self.plot}")
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import jaxpose
+from jaxpose._terminal import fail, prepare, say
 
 
 class _Subcommand(NamedTuple):
@@ -45,20 +46,24 @@ def main(args: Sequence[str] | None = None) -> None:
     Args:
         args: the command line; None is that of this process.
     """
+    prepare()
     args = sys.argv[1:] if args is None else list(args)
     name = args[0] if args else ""
     if name in ("--help", "-h", "--help-all"):
-        print(help_text())
+        say("jaxpose", help_text())
     elif name == "--version":
-        print(f"jaxpose {jaxpose.__version__}")
+        say("jaxpose", f"jaxpose {jaxpose.__version__}")
     elif name in SUBCOMMANDS:
-        from jaxpose.experiments.command import start  # here, as --help and --version do without
+        try:
+            from jaxpose.experiments.command import start  # here, as --help and --version do without
 
-        start(SUBCOMMANDS[name].module, args[1:], prog=f"jaxpose {name}")
+            start(SUBCOMMANDS[name].module, args[1:], prog=f"jaxpose {name}")
+        except KeyboardInterrupt:
+            fail(f"jaxpose {name}", "interrupted")
     else:
         near = difflib.get_close_matches(name, SUBCOMMANDS, 1)
         hint = f"; did you mean {near[0]}?" if near else ""
-        sys.exit(f"jaxpose: expected one of {', '.join(SUBCOMMANDS)}, got {name or 'nothing'}{hint}")
+        fail("jaxpose", f"expected one of {', '.join(SUBCOMMANDS)}, got {name or 'nothing'}{hint}")
 
 
 def help_text() -> str:

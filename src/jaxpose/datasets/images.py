@@ -11,6 +11,7 @@ from jaxtyping import Float
 from PIL import Image
 
 from jaxpose.errors import DataError
+from jaxpose.files.schema import FARTHEST_M
 from jaxpose.files.tables import read_numbers
 from jaxpose.files.untrusted import opened_image
 from jaxpose.geometry.rigid import nearest_rotation
@@ -18,6 +19,7 @@ from jaxpose.geometry.rigid import nearest_rotation
 SUFFIXES = (".png", ".jpg", ".jpeg")
 INTRINSICS = "camera-intrinsics.txt"
 _NONE = 65535  # like 0, no measurement: sensors and renderers clip what is too far to it
+_LARGEST_ENTRY = 1e3  # of what is made a rotation
 _MOST_OFF_ROTATION = 1e-2  # entries of a rotation matrix; beyond it a note says so
 _DEPTH_SAMPLES = 5  # depth images looked at before a sequence is accepted
 
@@ -183,6 +185,11 @@ def usable_poses(
     repaired = []
     for i in map(int, np.flatnonzero(finite)):
         pose = T_world_cam[i]
+        if np.abs(pose[:3, 3]).max() > FARTHEST_M or np.abs(pose[:3, :3]).max() > _LARGEST_ENTRY:
+            raise DataError(
+                f"{where(i)}: expected a rotation and a position up to {FARTHEST_M:g} m, got "
+                f"{' '.join(f'{number:g}' for number in pose[:3].ravel())}"
+            )
         determinant = np.linalg.det(pose[:3, :3])
         if np.abs(pose[3] - [0, 0, 0, 1]).max() > 1e-6 or determinant <= 0:
             raise DataError(

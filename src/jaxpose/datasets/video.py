@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxpose.errors import DataError
 
-EXTRA = 'pip install "jaxpose[video]"'
+EXTRA = 'pip install -e ".[video]"'
 _NEAR = 8  # frames ahead that are decoded on the way instead of sought
 
 

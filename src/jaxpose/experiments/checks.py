@@ -1,6 +1,5 @@
 """Checks that the configs of commands share: numbers, folders, options that would do nothing."""
 
-import json
 import math
 from collections.abc import Collection, Mapping
 from operator import attrgetter
@@ -8,6 +7,18 @@ from pathlib import Path
 from typing import Any
 
 from jaxpose.errors import DataError
+from jaxpose.files.untrusted import read_json
+
+RUN_FILES = (
+    "trajectory.txt",
+    "reference.txt",
+    "field.npz",
+    "map.npz",
+    "checkpoint.npz",
+    "points.ply",
+    "mesh.ply",
+)
+RUN_FILES += tuple(f"{name}.json" for name in ("camera", "settings", "config", "results")) + ("points.ply",)
 
 
 def option_name(path: str) -> str:
@@ -94,8 +105,18 @@ def check_apart(option: str, out: Path | None, *inputs: Path | None) -> None:
         ValueError: if they are the same file or folder.
     """
     for path in inputs:
-        if out is not None and path is not None and out.resolve() == path.resolve():
+        if out is not None and path is not None and _same(out, path):
             raise ValueError(f"{option}: expected another place than the input, got {out}")
+        if out is not None and path is not None and out.name in RUN_FILES and _same(out.parent, path):
+            raise ValueError(f"{option}: expected no file of the run that is read, got {out}")
+
+
+def _same(a: Path, b: Path) -> bool:
+    """Whether two paths are one file or folder, by links too."""
+    try:
+        return a.samefile(b)
+    except OSError:  # one of them is not there
+        return a.resolve() == b.resolve()
 
 
 def check_unused(config: Any, names: Collection[str], why: str) -> None:
@@ -132,6 +153,9 @@ def own_folder(folder: Path, stored: Path, settings: Mapping[str, Any], resume: 
         DataError: where the files are of a run with other settings, or of no run at all.
     """
     there = [path for name in names for path in sorted(folder.glob(name)) if path != stored]
+    for path in there:
+        if not path.resolve().is_relative_to(folder.resolve()):
+            raise DataError(f"{path}: expected a file in the run folder, got a link out of it")
     if not stored.exists():
         if there:
             raise DataError(f"{there[0]}: expected a new folder or that of a run, got a file of no run")
@@ -140,7 +164,7 @@ def own_folder(folder: Path, stored: Path, settings: Mapping[str, Any], resume: 
         for path in there:
             path.unlink()
         return False
-    before = json.loads(stored.read_text())
+    before = read_json(stored, "the settings of a run")
     for name, value in settings.items():
         if before.get(name) != value:
             option = option_name(name)

@@ -5,19 +5,25 @@ import io
 import os
 import re
 import sys
-from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import redirect_stderr
-from typing import Any, NamedTuple, NoReturn
+from collections.abc import Callable, Collection, Sequence
+from contextlib import nullcontext, redirect_stderr
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import platformdirs
 import tyro
 
+from jaxpose._terminal import fail, prepare, say
 from jaxpose.errors import DataError
 from jaxpose.experiments import progress
 from jaxpose.experiments.option_help import Groups, help_text
+from jaxpose.experiments.outcome import Outcome
 from jaxpose.experiments.progress import OnUpdate, Update
+from jaxpose.experiments.ranges import check_ranges
 from jaxpose.files.atomic import json_text
+from jaxpose.files.untrusted import reading
 
+CACHE_BYTES = 2 << 30  # of compiled steps, at most, when a command starts
 MODULE = "python -m jaxpose.experiments."
 
 
@@ -46,10 +52,14 @@ def start(module: str, args: Sequence[str] | None = None, **given: Any) -> None:
         args: the command line; None is that of this process.
         given: what else `main` takes.
     """
-    with progress.shown() as on_update:
-        on_update(Update("loading jaxpose", quiet=True))
-        main = importlib.import_module(module).main
-    main(args, **given)
+    prepare()
+    try:
+        with progress.shown() as on_update:
+            on_update(Update("loading jaxpose", quiet=True))
+            main = importlib.import_module(module).main
+        main(args, **given)
+    except KeyboardInterrupt:
+        fail(given.get("prog", "jaxpose"), "interrupted")
 
 
 def execute(command: Command, args: Sequence[str] | None = None) -> Any:
@@ -66,7 +76,14 @@ def execute(command: Command, args: Sequence[str] | None = None) -> Any:
     """
     config = parse(command, args)
     result = guarded(command.name, lambda on_update: command.run(config, on_update))
-    _say(json_text(result) if getattr(config, "json", False) else command.report(result))
+    results = result.folder / "results.json" if isinstance(result, Outcome) else None
+    resumed = results is not None and getattr(config, "resume", False)
+    try:
+        with reading(results, "the results of this run") if resumed and results else nullcontext():
+            said = json_text(result) if getattr(config, "json", False) else command.report(result)
+    except DataError as error:
+        fail(command.name, str(error))
+    say(command.name, said)
     return result
 
 
@@ -87,14 +104,16 @@ def parse(command: Command, args: Sequence[str] | None = None) -> Any:
         if asked in args:
             about = command.description or ""
             what = command.prog, command.config, about, command.groups, command.hidden
-            _say(help_text(*what, everything=everything))
+            say(command.name, help_text(*what, everything=everything))
             sys.exit(0)
     complaint = io.StringIO()
     try:
         with redirect_stderr(complaint):
-            return tyro.cli(
+            config = tyro.cli(
                 command.config, prog=command.prog, args=args, config=(tyro.conf.FlagCreatePairsOff,)
             )
+        check_ranges(config)
+        return config
     except SystemExit as stop:
         if not stop.code:
             raise
@@ -125,35 +144,56 @@ def guarded(name: str, action: Callable[[OnUpdate], Any]) -> Any:
         fail(name, "interrupted")
 
 
-def fail(name: str, message: str) -> NoReturn:
-    """Exit with code 1 and one line on stderr."""
-    sys.exit(f"{name}: {' '.join(message.split())}")
-
-
-def _say(text: str) -> None:
-    """Print to a reader that may have gone, as `head` does."""
-    try:
-        print(text, flush=True)
-    except BrokenPipeError:
-        sys.stdout = open(os.devnull, "w")  # what Python flushes at its end
-
-
 def _keep_compiled() -> None:
     """Keep what is compiled in the user's cache folder, so that the next start does not compile it again.
 
     What the user has set for JAX goes first: JAX_COMPILATION_CACHE_DIR names another folder, and
     JAX_ENABLE_COMPILATION_CACHE=false keeps nothing.
     """
-    settings: Mapping[str, Any] = {
-        "jax_compilation_cache_dir": platformdirs.user_cache_dir("jaxpose"),
-        "jax_persistent_cache_min_compile_time_secs": 0.0,
-    }
+    settings: dict[str, Any] = {"jax_persistent_cache_min_compile_time_secs": 0.0}
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+        folder = Path(platformdirs.user_cache_dir("jaxpose"))
+        if not _is_own(folder):
+            print(f"  compiled steps are not kept: {folder} is not this user's alone", file=sys.stderr)
+            return
+        _shrink(folder)
+        settings["jax_compilation_cache_dir"] = str(folder)
     for name, value in settings.items():
         if name.upper() in os.environ:
             continue
         os.environ[name.upper()] = str(value)  # for JAX, if a command loads it later, and for its children
         if "jax" in sys.modules:
             sys.modules["jax"].config.update(name, value)
+
+
+def _is_own(folder: Path) -> bool:
+    """Make a folder for this user alone, as it is to hold programs; False where it is somebody else's."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        found = folder.stat()
+        if hasattr(os, "getuid") and found.st_uid != os.getuid():
+            return False
+        if found.st_mode & 0o022:
+            folder.chmod(found.st_mode & 0o755)
+    except OSError:
+        return False
+    return True
+
+
+def _shrink(folder: Path) -> None:
+    """Delete the oldest files of a folder until the others are within the limit, and some more."""
+    try:
+        files = [(entry.stat(), entry.path) for entry in os.scandir(folder) if entry.is_file()]
+    except OSError:  # another command deletes too
+        return
+    size = sum(found.st_size for found, _ in files)
+    if size <= CACHE_BYTES:
+        return
+    for found, path in sorted(files, key=lambda file: file[0].st_mtime):
+        if size <= 0.75 * CACHE_BYTES:
+            return
+        size -= found.st_size
+        Path(path).unlink(missing_ok=True)
 
 
 def _one_line(boxed: str) -> str:

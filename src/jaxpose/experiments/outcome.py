@@ -6,6 +6,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from jaxpose.files import run_folder
+from jaxpose.files.schema import choice
+from jaxpose.files.untrusted import read_json
 
 SMOKE = "  SMOKE RUN, the numbers mean nothing"
 
@@ -15,6 +17,24 @@ class Outcome(NamedTuple):
 
     folder: Path
     results: dict[str, Any]
+
+
+def read_results(path: Path, experiment: str) -> dict[str, Any]:
+    """What a finished run has found.
+
+    Args:
+        path: its `results.json`.
+        experiment: of which it is.
+
+    Returns:
+        The content.
+
+    Raises:
+        DataError: for a damaged file, and for that of another experiment.
+    """
+    content = read_json(path, "the results of a run")
+    choice(path, content, "experiment", (experiment,))
+    return content
 
 
 def cost(started: float) -> dict[str, Any]:

@@ -19,9 +19,11 @@ from jaxpose.experiments.checks import own_folder
 from jaxpose.experiments.devices import Job
 from jaxpose.experiments.outcome import Outcome, cost
 from jaxpose.experiments.progress import OnUpdate, Update
+from jaxpose.experiments.ranges import check_ranges
 from jaxpose.fields import PoseField, set_progress
 from jaxpose.files import atomic
 from jaxpose.files import checkpoint as checkpoint_file
+from jaxpose.files.untrusted import read_json, reading
 from jaxpose.nn import Activation
 from jaxpose.training.steps import State, Trainer
 
@@ -111,7 +113,7 @@ def train(
     phase = " ".join(("training", label)).strip()
     on_update(Update(f"compiling the {phase}"))
     if job.writes and checkpoint.exists():
-        trained = checkpoint_file.load(checkpoint, trained)
+        trained = _checked(checkpoint, checkpoint_file.load(checkpoint, trained))
     started = time.perf_counter()
     with devices.guarded(job):
         state = devices.on_all(job, devices.from_first(job, trained.state))
@@ -244,15 +246,30 @@ def load_run(
     Raises:
         DataError, OSError: for a folder that holds no run.
     """
-    settings = json.loads((Path(folder) / "settings.json").read_text())
-    net, window = settings["net"], settings["net"]["window"]
-    net = NetConfig(**net | {"window": window and tuple(window)})
-    config = config_type(**settings | {"data": Path(settings["data"]), "net": net})
+    stored = Path(folder) / "settings.json"
+    settings = read_json(stored, "the settings of a run")
+    with reading(stored, "the settings of a run"):
+        net, window = settings["net"], settings["net"]["window"]
+        net = NetConfig(**net | {"window": window and tuple(window)})
+        config = config_type(**settings | {"data": Path(settings["data"]), "net": net})
+        check_ranges(config)
     problem = load(config)
     model = build(config, problem)
-    state = checkpoint_file.load(Path(folder) / "checkpoint.npz", initial_state(model, config.seed)).state
+    checkpoint = Path(folder) / "checkpoint.npz"
+    state = _checked(checkpoint, checkpoint_file.load(checkpoint, initial_state(model, config.seed))).state
     scene = set_progress(state.scene, jnp.ones(()))
     return Loaded(problem, model, state._replace(scene=scene))
+
+
+def _checked(path: Path, trained: Trained) -> Trained:
+    """The same; DataError for a training that cannot have stood there."""
+    step, last = int(trained.state.step), CHUNK * len(trained.history)
+    if not 0 <= step <= last or step % CHUNK:
+        raise DataError(f"{path}: expected a step up to {last}, got {step}")
+    for leaf in jax.tree.leaves((trained.state.pose, trained.state.scene)):
+        if jnp.issubdtype(leaf.dtype, jnp.floating) and not np.isfinite(leaf).all():
+            raise DataError(f"{path}: expected finite parameters, got NaN or infinity")
+    return trained
 
 
 def _plain(value: Any) -> Any:

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import math
 import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,26 +12,55 @@ from typing import Any
 
 import numpy as np
 
+from jaxpose.errors import DataError
+
+_MARK = ".unfinished"
+_TEMPORARY = re.compile(r"\..+\.\d+\.unfinished(\.\w+)?")
+
 
 @contextmanager
 def atomic(path: Path | str) -> Iterator[Path]:
     """Where to write a file that is to appear at `path` only when the block ends, and not if it fails.
 
     The temporary path is in the same folder and has the same suffix (by which some writers choose a format).
+    It is on the disk before it takes the place of `path`, so that a crash of the machine leaves one or the
+    other. A link is followed; DataError for what is no file, as a device; OSError names the path.
     """
     path = Path(path)
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    place = path.resolve() if path.is_symlink() else path
+    if place.exists() and not place.is_file():
+        raise DataError(
+            f"{path}: expected a file to write, got {'a folder' if place.is_dir() else 'a device'}"
+        )
+    temporary = place.with_name(f".{place.stem}.{os.getpid()}{_MARK}{place.suffix}")
     try:
         yield temporary
-        os.replace(temporary, path)
+        with temporary.open("rb") as written:
+            os.fsync(written.fileno())
+        os.replace(temporary, place)
+    except OSError as error:
+        if error.filename is None and error.errno is not None:  # a full disk does not say where
+            raise OSError(error.errno, os.strerror(error.errno), str(path)) from None
+        raise
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def clear_temporary(folder: Path) -> None:
+    """Delete what `atomic` has left in a folder where it was killed; nothing else.
+
+    Args:
+        folder: in which nothing is being written.
+    """
+    for path in folder.glob(f".*{_MARK}*"):
+        if _TEMPORARY.fullmatch(path.name) and path.is_file() and not path.is_symlink():
+            path.unlink(missing_ok=True)
 
 
 def write_text(path: Path | str, text: str) -> None:
     """Write a text file atomically."""
     with atomic(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
 def write_json(path: Path | str, value: Any) -> None:

@@ -2,6 +2,7 @@
 
 import os
 import platform
+import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime
@@ -10,6 +11,10 @@ from pathlib import Path
 import numpy as np
 
 import jaxpose
+from jaxpose.errors import DataError
+from jaxpose.files.atomic import clear_temporary
+
+LOCK = ".lock"  # of a run folder: host and process of the run that has it open
 
 
 def folder_path(experiment: str, *, name: str | None = None, out: Path | str | None = None) -> Path:
@@ -31,8 +36,8 @@ def folder_path(experiment: str, *, name: str | None = None, out: Path | str | N
 def opened(folder: Path) -> Iterator[Path]:
     """Make a run folder, and take it away again if what is done in it fails before anything is written.
 
-    A folder that exists is written over or resumed. Only folders that were made here are taken away, and only
-    empty ones.
+    A folder that exists is written over or resumed; what a killed run was writing is deleted. Only folders
+    that were made here are taken away, and only empty ones. While it is open no other run opens it.
 
     Args:
         folder: the run folder.
@@ -42,20 +47,58 @@ def opened(folder: Path) -> Iterator[Path]:
 
     Raises:
         OSError: at once where nothing can be written.
+        DataError: where another run has it open.
     """
     made = [path for path in (folder, *folder.parents) if not path.exists()]
     folder.mkdir(parents=True, exist_ok=True)
     try:
-        probe = folder / f".writable.{os.getpid()}"
-        probe.touch()
-        probe.unlink()
-        yield folder
+        with _locked(folder):
+            clear_temporary(folder)
+            yield folder
     except BaseException:
         for path in made:
             if any(path.iterdir()):
                 break
             path.rmdir()
         raise
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Hold the lock of a folder; the system lets go of it when the process ends, however it ends."""
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        yield
+        return
+    path, me = folder / LOCK, socket.gethostname()
+    while True:
+        stream = path.open("a+", encoding="utf-8")
+        stream.seek(0)
+        held = stream.read(200).split()
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            free = len(held) != 2 or held[0] == me  # of another host the lock may not be seen here
+        except OSError:
+            free = False
+        if not free:
+            stream.close()
+            host, pid = held if len(held) == 2 else ("this host", "unknown")
+            raise DataError(
+                f"{folder}: expected no other run in it, got one of process {pid} on {host}"
+                + ("" if host == me else f"; if that has ended, delete {path}")
+            )
+        if path.exists() and os.fstat(stream.fileno()).st_ino == path.stat().st_ino:
+            break
+        stream.close()  # a run that ended has deleted it in between
+    try:
+        stream.truncate(0)
+        stream.write(f"{me} {os.getpid()}\n")
+        stream.flush()
+        yield
+    finally:
+        path.unlink(missing_ok=True)
+        stream.close()
 
 
 def peak_rss_bytes() -> int:

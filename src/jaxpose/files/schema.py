@@ -15,6 +15,7 @@ from jaxtyping import Float
 from jaxpose.errors import DataError
 
 FARTHEST_M = 1e9  # [m] of a position; a float64 has less than a micrometre there
+LATEST_S = 7_258_118_400.0  # [s] since 1970: the year 2200, of timestamps
 _MOST_OFF_ROTATION = 1e-3  # entries of a rotation matrix
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from jaxpose._checks import check_shapes
+from jaxpose._checks import check_finite, check_shapes
 
 # (x - sin x)/x^3 in x^2; below 1 the terms left out are less than 1e-16
 _SINE = [(-1) ** k / math.factorial(2 * k + 3) for k in range(8)]
@@ -155,10 +155,14 @@ def nearest_rotation(matrix: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "
     Returns:
         (..., 3, 3).
 
+    Raises:
+        ValueError: for NaN and infinity.
+
     >>> nearest_rotation(2 * np.eye(3)).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     """
     check_shapes(matrix=(matrix, "*n 3 3"))
+    check_finite(matrix=matrix)  # a decomposition of others may not return
     left, _, right = np.linalg.svd(matrix)
     left[..., :, 2] *= np.sign(np.linalg.det(left @ right))[..., None]
     return left @ right

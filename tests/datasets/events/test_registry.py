@@ -201,3 +201,18 @@ def test_check_reads_archives(made):
     assert any("expected pixels of 64x48, got up to 64, 47" in str(finding) for finding in result.findings)
     write({**data, "p": data["p"] + 1})
     assert check.exit_code(check.run(check.Config(folder))) == 1
+
+
+@pytest.mark.parametrize(
+    ("t", "words"),
+    [
+        (np.array([0.0, 1e300]), "event 1: expected a timestamp before the year 2200, got 1e\\+300"),
+        (np.array([0, 2**64 - 1], np.uint64), "event 1: expected a timestamp before the year 2200"),
+        (np.array([-(2**63), 5], np.int64), "event 0: expected a timestamp before the year 2200"),
+        (np.array(["2026-01-01", "2026-01-02"], "M8[D]"), "expected a whole npz file, got entries of type"),
+    ],
+)
+def test_times_of_no_time_are_refused(tmp_path, t, words):
+    np.savez(tmp_path / "a.npz", t=t, x=np.zeros(2, int), y=np.zeros(2, int), p=np.zeros(2, int))
+    with pytest.raises(DataError, match=f"a.npz: {words}"):
+        event_npz.load(tmp_path / "a.npz", size=(4, 4))

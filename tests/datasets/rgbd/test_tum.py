@@ -271,6 +271,7 @@ FIRST = "rgb/1305031102.000000.png"
         ("rgb.txt", "one rgb/1.png\n", "rgb.txt:1: expected a timestamp in seconds"),
         ("rgb.txt", "nan rgb/1.png\n", "rgb.txt:1: expected a timestamp in seconds"),
         ("rgb.txt", "2 a.png\n2 b.png\n", "rgb.txt:2: expected a timestamp after 2.0 s, got 2.0 s"),
+        ("rgb.txt", "2 ../../a.png\n", "rgb.txt: expected a file name that stays in its folder, got"),
         (FIRST, "text", f"{FIRST}: expected an image, got cannot identify"),
         ("groundtruth.txt", "1 2 3\n", "groundtruth.txt:1: expected a trajectory, TUM .*got '1 2 3'"),
         ("groundtruth.txt", "1 0 0 0 0 0 0 x\n", "groundtruth.txt:1: expected 8 numbers"),

@@ -70,7 +70,8 @@ class Config:
         check_least(self, posenet_octaves=0, posenet_layers=1, posenet_width=1, steps=1)
         check_positive(self, "bspline_hz", "recorded_hz")
         check_positive(self, "position_sigma", "rotation_sigma_deg")
-        check_apart("--out", self.out, self.trajectory)
+        check_apart("--out", self.out, self.trajectory, self.imu, self.extrinsics)
+        check_apart("--kalibr", self.kalibr, self.trajectory, self.imu, self.extrinsics, self.out)
         if self.estimate and self.imu is None:
             raise ValueError("--estimate: expected --imu with it, got none")
         if not self.estimate:

@@ -15,6 +15,7 @@ from typing import Annotated, NamedTuple
 
 import tyro
 
+from jaxpose.cli.view import access
 from jaxpose.cli.view.animation import animate
 from jaxpose.cli.view.scene import read_scene
 from jaxpose.errors import DataError
@@ -75,16 +76,18 @@ def run(config: Config, on_update: OnUpdate = silent) -> Shown:
     try:
         from jaxpose.cli.view import page as view_page
     except ImportError:
-        raise DataError('expected viser, got none: pip install "jaxpose[viewer]"') from None
+        raise DataError('expected viser, got none: pip install -e ".[viewer]"') from None
+    allowed = access.access(config.host)
     scene = read_scene(config.run, config.frustums, on_update)
     if config.save is not None:
         view_page.save(scene, config.save, on_update)
         return Shown(scene.name, None, config.save, scene.notes, lambda: None)
     on_update(Update("opening the page", quiet=True))
-    port, close = view_page.serve(scene, config.host, config.port)
+    port, close = view_page.serve(scene, allowed, config.port)
     notes = () if config.port in (0, port) else (f"port {config.port} is taken",)
-    host = "localhost" if config.host in ("127.0.0.1", "0.0.0.0") else config.host
-    return Shown(scene.name, f"http://{host}:{port}", None, (*notes, *scene.notes), close)
+    if allowed.token is not None:
+        notes += ("other machines reach this page: whoever has its address, token and all, sees the run",)
+    return Shown(scene.name, access.url(allowed, port), None, (*notes, *scene.notes), close)
 
 
 def main(args: Sequence[str] | None = None, prog: str = "jaxpose view") -> None:

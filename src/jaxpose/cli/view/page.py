@@ -1,5 +1,6 @@
 """The page of a run: what `scene` found, drawn with viser, with a slider for time, or in a file."""
 
+import html
 import io
 import queue
 import threading
@@ -14,6 +15,8 @@ import viser
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from jaxpose._terminal import printable
+from jaxpose.cli.view.access import Access, guarding
 from jaxpose.cli.view.types import WIDTH, Picture, Scene
 from jaxpose.errors import DataError
 from jaxpose.experiments.progress import OnUpdate, Update, silent
@@ -24,9 +27,10 @@ _SAVED_FRAMES = 100  # of the camera on its way in a saved file, at most
 _ESTIMATE, _TRUTH, _KEYFRAME, _CAMERA = (31, 119, 180), (214, 39, 40), (255, 127, 14), (44, 160, 44)
 
 
-def serve(scene: Scene, host: str, port: int) -> tuple[int, Callable[[], None]]:
+def serve(scene: Scene, allowed: Access, port: int) -> tuple[int, Callable[[], None]]:
     """Show the scene at a port, or at the next free one, which is returned with what ends it."""
-    server = _server(host, port)
+    with guarding(allowed):
+        server = _server(allowed.host, port)
     try:
         picture = None if scene.render is None else scene.render(0.0, WIDTH)
         stop = _panel(server, scene, _draw(server, scene, picture), picture)
@@ -179,12 +183,21 @@ def _panel(
         assert scene.render is not None and shows is not None
         shows.image = camera.image = scene.render(min(t, last), WIDTH)
 
-    ask, stop = latest(render)
+    said = gui.add_html("", visible=False)
+
+    def show(error: Exception | None) -> None:
+        said.content = "" if error is None else paragraphs(f"at this time: {error or type(error).__name__}")
+        said.visible = error is not None
+
+    ask, stop = latest(render, show)
 
     @time.on_update
     async def _(event) -> None:  # on the server's own thread, so one after the other
-        with server.atomic():
-            _move(camera, scene, min(time.value, last))
+        try:
+            with server.atomic():
+                _move(camera, scene, min(time.value, last))
+        except Exception as error:  # it is shown, and the page lives on
+            return show(error)
         if scene.render is not None:
             ask(time.value)
 
@@ -199,8 +212,13 @@ def _panel(
         node = server.scene.get_handle_by_name(name)
         if node is not None:
             _switch(gui, node, label)
-    gui.add_markdown("\n\n".join((scene.name, *scene.notes)))
+    gui.add_html(paragraphs(scene.name, *scene.notes))
     return stop
+
+
+def paragraphs(*texts: str) -> str:
+    """Texts as HTML that shows them letter by letter: names in a run folder may be anybody's."""
+    return "".join(f"<p>{html.escape(printable(text))}</p>" for text in texts)
 
 
 def _switch(gui: Any, node: Any, label: str) -> None:
@@ -211,10 +229,12 @@ def _switch(gui: Any, node: Any, label: str) -> None:
         node.visible = box.value
 
 
-def latest(work: Callable[[float], None]) -> tuple[Callable[[float], None], Callable[[], None]]:
+def latest(
+    work: Callable[[float], None], show: Callable[[Exception | None], None]
+) -> tuple[Callable[[float], None], Callable[[], None]]:
     """Ask for a value to be worked on, one at a time and the last one first: those it overtakes are dropped.
 
-    The second function ends the work.
+    The second function ends the work. `show` is called with what went wrong, or None, after each.
     """
     asked: queue.SimpleQueue[float | None] = queue.SimpleQueue()
 
@@ -225,7 +245,12 @@ def latest(work: Callable[[float], None]) -> tuple[Callable[[float], None], Call
                 value = asked.get()
             if value is None:
                 return
-            work(value)
+            try:
+                work(value)
+            except Exception as error:  # the next value may do
+                show(error)
+            else:
+                show(None)
 
     threading.Thread(target=loop, daemon=True).start()
     return asked.put, lambda: asked.put(None)

@@ -1,6 +1,5 @@
 """What the scene of a run shows at a time: the map of a SLAM run, the radiance field of a NeRF."""
 
-import json
 from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
@@ -15,6 +14,7 @@ from jaxpose.errors import DataError
 from jaxpose.experiments.event_nerf import pipeline as event_nerf
 from jaxpose.experiments.noisy_nerf import pipeline as noisy_nerf
 from jaxpose.experiments.slam.map_file import read_map
+from jaxpose.files.untrusted import read_json
 from jaxpose.geometry.camera import Camera, scale
 from jaxpose.scenes.voxel_blocks import bounds, voxel_blocks
 from jaxpose.slam.map.raycast import every, viewer
@@ -37,7 +37,7 @@ def of_map(file: Path, camera: Camera, poses: Poses) -> Render:
 
 def of_radiance(folder: Path, first: float) -> Render:
     """The radiance field of a NeRF run from where its pose field is `t` after `first` [s]."""
-    experiment = json.loads((folder / "results.json").read_text()).get("experiment")
+    experiment = read_json(folder / "results.json", "the results of a run").get("experiment")
     if experiment == "event_nerf":
         loaded = event_nerf.load_run(folder)
         problem = loaded.problem

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from jaxpose.errors import DataError
+from jaxpose.files.schema import LATEST_S
 
 Unit = Literal["s", "us", "ns", "frames"]  # of timestamps; "frames": indices, of which one is taken for 1 s
 
@@ -65,10 +66,12 @@ def stream_stats(
         if not len(block.t):
             continue
         check_numbers(stream, block, seen)
+        _check_times(stream, block.t, seen, _PER_SECOND["ns" if stats is None else stats.unit])
         block = block._replace(t=block.t.astype(np.float64 if block.t.dtype.kind == "f" else np.int64))
         if stats is None:
             first = zero if zero is not None else block.t[0].item()
             stats = StreamStats(unit or _possible(block.t, stream) or find_unit(block.t), first)
+            _check_times(stream, block.t, seen, _PER_SECOND[stats.unit])
         # Integers as integers: float64 has not the digits for nanoseconds since 1970.
         t = (block.t - block.t.dtype.type(stats.zero)).astype(np.float64) / _PER_SECOND[stats.unit]
         block = block._replace(t=t)
@@ -173,6 +176,16 @@ def check_numbers(stream: Stream, block: Block, seen: int) -> None:
                 row = int(usable.argmin())
                 wanted = "a finite timestamp" if name == "t" else f"a whole number for {name}"
                 raise DataError(f"{stream.where(seen + row)}: expected {wanted}, got {values[row]:g}")
+
+
+def _check_times(stream: Stream, t: np.ndarray, seen: int, per_second: float) -> None:
+    """Refuse timestamps that are not of this time: differences of them would overflow."""
+    latest = max(float(t.max()), -float(t.min()))
+    if not latest <= LATEST_S * per_second:
+        row = int(np.argmax(np.abs(t.astype(np.float64))))
+        raise DataError(
+            f"{stream.where(seen + row)}: expected a timestamp before the year 2200, got {t[row]:g}"
+        )
 
 
 def _possible(t: np.ndarray, stream: Stream) -> Unit | None:

@@ -23,6 +23,7 @@ from jaxpose.datasets.images import (
 )
 from jaxpose.datasets.types import Frame, Recording
 from jaxpose.errors import DataError
+from jaxpose.files.schema import name_inside
 from jaxpose.files.tables import seconds
 from jaxpose.geometry.camera import Camera, resized
 
@@ -133,10 +134,13 @@ def listed(
         Which of them (indices), their files, and a note on the others.
 
     Raises:
-        DataError: Where none is there.
+        DataError: Where none is there, and for a name that leads out of the folder.
     """
     listing = Listing(root)
-    files = {i: file for i, name in enumerate(names) if (file := listing.find(name)) is not None}
+    files = {}
+    for i, name in enumerate(names):
+        if (file := listing.find(name_inside(where, name))) is not None:
+            files[i] = file
     lacking = [name for i, name in enumerate(names) if i not in files]
     if not files:
         raise DataError(

@@ -22,7 +22,7 @@ from jaxpose.files.untrusted import read_json
 from jaxpose.geometry import rigid
 from jaxpose.geometry.camera import Camera, resized
 
-EXTRA = 'pip install "jaxpose[phone]"'
+EXTRA = 'pip install -e ".[phone]"'
 _ENTRY = re.compile(r"rgbd/(\d+)\.(jpg|depth|conf)")
 _MOST_BYTES = 1 << 28  # of an entry
 

@@ -10,7 +10,7 @@ from jaxpose.errors import DataError
 _MAGIC = {b"#ROSBAG V2.0": ".bag", b"\x89MCAP0\r\n": ".mcap", b"SQLite format 3\0": ".db3"}
 _METADATA = "metadata.yaml"
 _KINDS = "a ROS bag: .bag, .mcap, .db3, or a folder with metadata.yaml"
-EXTRA = 'pip install "jaxpose[ros]"'
+EXTRA = 'pip install -e ".[ros]"'
 
 
 class Topic(NamedTuple):

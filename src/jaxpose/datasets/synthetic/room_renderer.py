@@ -22,6 +22,8 @@ from jaxpose.datasets.types import Frame, Recording
 from jaxpose.geometry.camera import Camera, unproject
 from jaxpose.imu import ADIS16448, GRAVITY_WORLD, ImuNoise
 
+_MOST_SAMPLES = 1e8  # of a sensor over the walk
+
 
 @dataclass(frozen=True)
 class RoomConfig:
@@ -59,6 +61,10 @@ class RoomConfig:
             raise ValueError(f"RoomConfig.line_delay_us: expected at most 1000 us, got {self.line_delay_us}")
         if self.sensor not in RANGES:
             raise ValueError(f"RoomConfig.sensor: expected one of {', '.join(RANGES)}, got {self.sensor}")
+        for rate in ("rate_hz", "imu_rate_hz"):
+            if not self.duration_s * getattr(self, rate) <= _MOST_SAMPLES:
+                got = f"{self.duration_s:g} s at {getattr(self, rate):g} Hz"
+                raise ValueError(f"RoomConfig.{rate}: expected up to {_MOST_SAMPLES:g} samples, got {got}")
         if self.duration_s * self.rate_hz < 1:
             raise ValueError(f"RoomConfig: expected two frames, got {self.duration_s} s at {self.rate_hz} Hz")
 

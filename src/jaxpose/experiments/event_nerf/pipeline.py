@@ -6,7 +6,6 @@ folders, DAVIS text, HDF5 (DSEC) and npz. `--study known` puts both trajectories
 known instants (table 4), `--study offset` for a turntable whose axis is wrong.
 """
 
-import json
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -33,7 +32,7 @@ from jaxpose.experiments.event_nerf.options import (
     studies,
 )
 from jaxpose.experiments.event_nerf.report import describe_step, report, table
-from jaxpose.experiments.outcome import Outcome
+from jaxpose.experiments.outcome import Outcome, read_results
 from jaxpose.experiments.progress import OnUpdate, Update, silent
 from jaxpose.experiments.training_loop import Loaded, Trained
 from jaxpose.fields import save
@@ -110,7 +109,7 @@ def _single(
     if job.writes:
         training_loop.set_up_run_folder(folder, config, resume_fingerprint(config))
     if devices.from_first(job, job.writes and finished.exists()):
-        return json.loads(finished.read_text()) if job.writes else devices.followed(job)
+        return read_results(finished, "event_nerf") if job.writes else devices.followed(job)
     model = build(config, problem)
     ground_truth = find_truth(problem)
     checkpoint = folder / "checkpoint.npz"

@@ -6,7 +6,6 @@ photographs with poses (Blender, nerfstudio, instant-ngp, LLFF). `--study fields
 by side.
 """
 
-import json
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -38,7 +37,7 @@ from jaxpose.experiments.noisy_nerf.options import (
     studies,
 )
 from jaxpose.experiments.noisy_nerf.report import describe_step, report, table
-from jaxpose.experiments.outcome import Outcome
+from jaxpose.experiments.outcome import Outcome, read_results
 from jaxpose.experiments.progress import OnUpdate, Update, silent
 from jaxpose.experiments.training_loop import Loaded, Trained
 from jaxpose.fields import save
@@ -145,7 +144,7 @@ def _single(
     if job.writes:
         training_loop.set_up_run_folder(folder, config, resume_fingerprint(config))
     if devices.from_first(job, job.writes and finished.exists()):
-        return json.loads(finished.read_text()) if job.writes else devices.followed(job)
+        return read_results(finished, "noisy_nerf") if job.writes else devices.followed(job)
     model = build(config, problem)
     trained = train(config, problem, model, checkpoint, job, on_update, label)
     devices.leave(job)

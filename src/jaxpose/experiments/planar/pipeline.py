@@ -5,7 +5,6 @@ folder under outputs/planar. `--setup homography` is BARF's own set-up, `--compa
 by side.
 """
 
-import json
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -29,6 +28,7 @@ from jaxpose.experiments.planar.warps import Pose, homography_warps, motion_warp
 from jaxpose.experiments.progress import OnUpdate, Update, silent
 from jaxpose.fields import PoseNetConfig
 from jaxpose.files import atomic, run_folder
+from jaxpose.files.untrusted import read_json
 from jaxpose.plots import planar as planar_plots
 from jaxpose.scenes._image import ImageConfig, image
 
@@ -221,7 +221,7 @@ def _file(folder: Path, motion: int) -> Path:
 
 
 def _finished(folder: Path, motions: int) -> list[dict[str, Any]]:
-    return [json.loads(_file(folder, motion).read_text()) for motion in range(motions)]
+    return [read_json(_file(folder, motion), "the result of a motion") for motion in range(motions)]
 
 
 def _curves(motions: list[dict[str, Any]]) -> Float[np.ndarray, "m c"]:

@@ -11,11 +11,12 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 from jaxtyping import Bool, Float
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import map_coordinates
 
 from jaxpose.errors import DataError
+from jaxpose.files.untrusted import opened_image
 
 PATCHES = {"paper": 7, "homography": 5}
 _KNOTS = 10  # random points of a path, per dimension
@@ -57,13 +58,10 @@ class Task(NamedTuple):
 def read_photo(path: Path) -> Photo:
     """Any image as RGB; a longer side of more than 640 px is reduced to that.
 
-    DataError for a file that is no image or is smaller than 32 px, OSError where there is none.
+    DataError for a file that is no image or is smaller than 32 px.
     """
-    try:
-        with Image.open(path) as file:
-            picture = file.convert("RGB")
-    except (UnidentifiedImageError, Image.DecompressionBombError, SyntaxError) as error:
-        raise DataError(f"{path}: expected an image, got {error}") from None
+    with opened_image(path) as file:
+        picture = file.convert("RGB")
     width, height = picture.size
     if min(width, height) < _LEAST_SIDE:
         raise DataError(

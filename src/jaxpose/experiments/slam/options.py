@@ -84,7 +84,7 @@ class Options:
         check_positive(self, "recorded_hz", "rate_hz", "slam.voxel", "slam.map_every_s")
         check_finite(self, "imu_offset_s")
         check_least(self, start=0, frames=FEWEST_FRAMES)
-        check_run_folder(self, self.data)
+        check_run_folder(self, self.data, self.imu_file, self.imu_extrinsics, self.room.along)
         self._check_data()
         self._check_imu()
         self._check_method()

@@ -1,6 +1,5 @@
 """What the SLAM experiments do: track a recording, and leave its run folder."""
 
-import json
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -15,7 +14,7 @@ from jaxpose.datasets.types import Recording
 from jaxpose.evaluation import trajectory_error
 from jaxpose.experiments.checks import own_folder
 from jaxpose.experiments.command import Command, execute
-from jaxpose.experiments.outcome import Outcome, cost
+from jaxpose.experiments.outcome import Outcome, cost, read_results
 from jaxpose.experiments.progress import OnUpdate, Update, silent
 from jaxpose.experiments.slam.checkpointing import checkpoint_callback
 from jaxpose.experiments.slam.options import GROUPS, HIDDEN, Options, resume_fingerprint, slam_config
@@ -109,7 +108,7 @@ def _single(
     settings = resume_fingerprint(options)
     own_folder(folder, folder / "settings.json", settings, options.resume, checkpoint.name, finished.name)
     if finished.exists():
-        return json.loads(finished.read_text()), _written_errors(folder, recording)
+        return read_results(finished, experiment), _written_errors(folder, recording)
     on_update(Update(f"compiling, IMU {mode}: the first frames are slow"))
     config, state = slam_config(options), None
     if checkpoint.exists():

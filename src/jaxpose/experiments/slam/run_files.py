@@ -93,7 +93,7 @@ def _write_surface(folder: Path, recording: Recording, result: SlamResult) -> tu
     try:
         surface = mesh(result.map_config, result.scene_params[0], keyframes(), recording.camera)
     except ImportError:
-        return ('no mesh.ply: pip install "jaxpose[mesh]" for marching cubes',)
+        return ('no mesh.ply: pip install -e ".[mesh]" for marching cubes',)
     write_ply(folder / "mesh.ply", surface.points, surface.rgb, surface.faces)
     return ()
 
