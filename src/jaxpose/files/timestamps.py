@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 Unit = Literal["s", "ms", "us", "ns"]
 PER_SECOND: dict[Unit, int] = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}
+_LARGEST = Decimal(10) ** 19  # ns since 1970 until the year 2286
 _SINCE_1970_S = (1e8, 4e9)  # from 1973 to 2096
 _WHOLE_PERIOD_S = 2.0  # numbers that are all whole and so far apart are no seconds
 FLOAT_S = 1e6  # below it float64 seconds hold whole ns
@@ -32,12 +33,12 @@ _LEAST_S = 1e-5  # steps below it make no sense
 
 
 def to_decimal(word: str) -> Decimal | None:
-    """A number as it is written, to its last digit; None for what is none, NaN and infinity among it."""
+    """A number as it is written, to its last digit; None for what is none, NaN and what no clock shows."""
     try:
         number = Decimal(word)
     except InvalidOperation:
         return None
-    return number if number.is_finite() else None
+    return number if number.is_finite() and abs(number) < _LARGEST else None
 
 
 def to_ns(number: Decimal, unit: Unit) -> int:

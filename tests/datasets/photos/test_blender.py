@@ -270,7 +270,7 @@ MIRROR = np.diag([1.0, 1, -1, 1]).tolist()
             lambda folder, _: (folder / "transforms.json").write_text("{,"),
             r"transforms.json:1: expected JSON",
         ),
-        (lambda folder, _: rewrite(folder, "transforms.json", []), r"expected a JSON object"),
+        (lambda folder, _: rewrite(folder, "transforms.json", []), r"expected JSON, got no JSON object"),
         (spoil(frames="many"), r"expected a list of frames, got many"),
         (spoil_frame("file_path", None), r"expected a file_path in every frame"),
         (no_images, r"transforms.json: expected images beside it, got none of the 5"),

@@ -32,7 +32,7 @@ def find_photographs(path: Path) -> registry.Format | None:
 
 def check_photographs(path: Path, layout: registry.Format) -> tuple[str, Checked]:
     """The layout in words, count, camera, extent and notes of photographs; where the cameras look."""
-    name = _NAMES[layout]
+    name = _NAMES.get(layout, "")
     if layout == "transforms":
         file = blender.transforms_file(path)
         maker = "Blender" if file.name == "transforms_train.json" else "nerfstudio, instant-ngp"

@@ -1,6 +1,5 @@
 """Poses written back as `transforms.json`, for Blender's readers, nerfstudio and instant-ngp."""
 
-import json
 import math
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ from jaxpose.datasets.photos.lens import ORDER, Lens, from_camera
 from jaxpose.datasets.types import Photographs
 from jaxpose.errors import DataError
 from jaxpose.files.atomic import write_json
+from jaxpose.files.untrusted import read_json
 
 
 def write_transforms(
@@ -50,7 +50,7 @@ def write_transforms(
             for name, t, keys in zip(photographs.files, times, each, strict=True)
         ]
     else:
-        content = json.loads(Path(source).read_text(encoding="utf-8-sig"))
+        content = read_json(source, "JSON")
         by_name = {frame["file_path"]: frame for frame in content["frames"]}
         for name in photographs.files:
             if name not in by_name:

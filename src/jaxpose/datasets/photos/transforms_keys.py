@@ -1,6 +1,5 @@
 """What the keys of a `transforms.json` say of camera and depths, and which say more than is used."""
 
-import json
 import math
 from collections.abc import Iterable
 from pathlib import Path
@@ -9,6 +8,7 @@ from typing import Any
 from jaxpose.datasets.images import some
 from jaxpose.datasets.photos.lens import Kind, Lens, lens
 from jaxpose.errors import DataError
+from jaxpose.files.untrusted import read_json
 
 _LENS = ("k1", "k2", "p1", "p2", "k3", "k4")
 INTRINSICS = ("camera_angle_x", "camera_angle_y", "fl_x", "fl_y", "cx", "cy", "w", "h", *_LENS)
@@ -26,21 +26,18 @@ _WITHOUT_EFFECT = (
 )  # fmt: skip
 
 
+_LARGEST = 1e300  # of a number: it is squared
+
+
 def parse(file: Path) -> dict[str, Any]:
     """The JSON object of a file; DataError naming the line for what is none."""
-    try:
-        content = json.loads(file.read_text(encoding="utf-8-sig", errors="replace"))
-    except json.JSONDecodeError as error:
-        raise DataError(f"{file}:{error.lineno}: expected JSON, got {error.msg}") from None
-    if not isinstance(content, dict):
-        raise DataError(f"{file}: expected a JSON object, got {str(content)[:60]}")
-    return content
+    return read_json(file, "JSON")
 
 
 def number(file: Path, entries: dict[str, Any], key: str) -> float:
     """The number of a key; DataError where it is none."""
     value = entries[key]
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < _LARGEST:
         raise DataError(f"{file}: expected a number for {key}, got {str(value)[:60]}")
     return float(value)
 
