@@ -7,7 +7,8 @@ import pytest
 from helpers.checks import FLIP, T0_NS, checked, faults, inverted, named_tests
 from scipy.spatial.transform import Rotation
 
-from jaxpose.cli.check.command import exit_code
+from jaxpose.cli.check import command as check
+from jaxpose.cli.check.command import Config, exit_code
 
 
 def turning(t):
@@ -117,3 +118,62 @@ def test_without_truth_the_readings_are_still_checked(tmp_path):
     (folder / "imu0/data.csv").unlink()
     (folder / "imu0/sensor.yaml").unlink()
     assert exit_code(checked(tmp_path)) == 1
+
+
+def without_truth(folder):
+    (folder / "mav0/state_groundtruth_estimate0/data.csv").unlink()
+    return folder
+
+
+def swapped(folder):
+    file = folder / "mav0/imu0/data.csv"
+    head, *lines = file.read_text().splitlines()
+    rows = [line.split(",") for line in lines]
+    file.write_text("\n".join([head, *(",".join([r[0], *r[4:], *r[1:4]]) for r in rows)]))
+    return folder
+
+
+def weightless(folder):
+    file, t = folder / "mav0/imu0/data.csv", np.arange(0, 30, 0.01)
+    head, *lines = file.read_text().splitlines()
+    rows = [line.split(",")[:4] for line in lines]
+    forces = turning(t).inv().apply(acceleration(t)).tolist()
+    text = [",".join([*row, *map(str, f)]) for row, f in zip(rows, forces, strict=True)]
+    file.write_text("\n".join([head, *text]))
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("fault", "change", "test", "words"),
+    [
+        ({}, None, None, ""),
+        ({"gyro": 180 / np.pi}, None, "gyroscope unit", "in deg/s"),
+        ({"force": 1 / 9.80665}, None, "accelerometer unit", "in g; multiply by 9.80665"),
+        ({"force": -1 / 9.80665}, None, "accelerometer unit", "in g; multiply by 9.80665"),
+        ({}, swapped, "gyroscope and accelerometer", "swap the columns"),
+        ({}, weightless, "gravity", "gravity was removed"),
+    ],
+)
+def test_readings_alone_say_what_is_wrong_with_them(tmp_path, fault, change, test, words):
+    folder = without_truth(euroc(tmp_path, **fault))
+    file = (change(folder) if change else folder) / "mav0/imu0/data.csv"
+    for result in (checked(folder), checked(file)):
+        assert named_tests(result) == ([test] if test else []) and words in faults(result), faults(result)
+    assert checked(file).format == "IMU readings"
+
+
+def test_an_imu_file_of_ones_own_beside_poses(tmp_path):
+    folder = euroc(tmp_path, force=-1.0) / "mav0"
+    poses, readings = folder / "state_groundtruth_estimate0/data.csv", folder / "imu0/data.csv"
+    result = check.run(Config(poses, imu_file=readings))
+    assert named_tests(result) == ["gravity"] and "change the sign" in faults(result)
+    assert "mounting not stated" in " ".join(fact.text for fact in result.facts)
+
+
+def test_gaps_are_no_clean_bill(tmp_path):
+    file = euroc(tmp_path) / "mav0/imu0/data.csv"
+    lines = file.read_text().splitlines()
+    lines[7] = lines[7].replace(",", ",nan,", 1).rsplit(",", 1)[0]
+    file.write_text("\n".join([*lines, lines[-1]]))
+    result = checked(tmp_path)
+    assert named_tests(result) == ["missing readings"] and "2 of 3001 lines" in faults(result)

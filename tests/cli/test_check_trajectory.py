@@ -26,6 +26,9 @@ def test_a_good_trajectory_has_no_fault(tmp_path):
 def test_units_of_stamps_are_read_and_said(tmp_path, seconds, unit, start):
     moved = AROUND._replace(t=AROUND.t - T0 + start)
     result = checked(write_rows(tmp_path / "t.txt", moved, seconds=seconds))
+    if (start, unit) == (0.0, "ms"):  # 50 s apart, or 50 ms
+        assert "which may be s or ms" in faults(result) and exit_code(result) == 1
+        return
     assert faults(result) == "" and any(f"timestamps are in {unit}" in note for note in result.notes)
     assert result.facts[0].numbers["rate_hz"] == pytest.approx(20, rel=1e-3)
     assert result.facts[0].numbers["unit"] == unit

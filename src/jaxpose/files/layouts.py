@@ -31,7 +31,7 @@ class Layout(NamedTuple):
     words: str  # what a line holds
     unit: Unit = "s"  # of the timestamps
     unit_is_stated: bool = False  # by a header or by the user
-    only_unit: Unit | None = None  # another is refused
+    refused_unit: Unit | None = None  # timestamps in it would mean another layout
     order: Literal["xyzw", "wxyz"] | None = None
 
 
@@ -94,7 +94,7 @@ def pose_layout(path: Path, table: Table, columns: str | None) -> Layout:
 def _unnamed_csv(path: Path, table: Table, width: int) -> Layout:
     """Csv without a header: EuRoC's where timestamps are in ns, xyzw where they are in seconds."""
     if width > 8:
-        return EUROC._replace(only_unit="ns")
+        return EUROC._replace(refused_unit="s")
     numbers = [number for row in table.words if (number := to_decimal(row[0])) is not None]
     found = units(numbers, "s") if numbers else ["ns"]
     if len(numbers) == 1 and not Decimal(1e9) < numbers[0] < Decimal(4e9) and numbers[0] == int(numbers[0]):

@@ -29,6 +29,7 @@ class Steps(NamedTuple):
 
 POSES = Steps(5e-4, 2.0, 3600.0)
 READINGS = Steps(1.2e-4, 0.2, 1.0)  # of an IMU
+_DIGITS_NS = 1e3  # steps of ns below it have no decimals
 _LEAST_S = 1e-5  # steps below it make no sense
 
 
@@ -68,19 +69,21 @@ def units(numbers: Sequence[Decimal], expected: Unit, steps: Steps = POSES) -> l
     size = {unit: latest / PER_SECOND[unit] for unit in get_args(Unit)}
     dated = [unit for unit, s in size.items() if _SINCE_1970_S[0] <= s <= _SINCE_1970_S[1]]
     whole = all(number == number.to_integral_value() for number in numbers)
-    if not whole:
+    step = _median_step(numbers)
+    if not whole and (step is None or step < _DIGITS_NS):
         size.pop("ns")
     if expected in dated and expected in size:
         return [expected]
     if size.get(expected, np.inf) > _SINCE_1970_S[1] and dated:
         return dated
-    step = _median_step(numbers)
     if step is None:
         return [expected] if expected in size else list(size)
     period = {unit: step / PER_SECOND[unit] for unit in size}
     longest = _WHOLE_PERIOD_S if whole and expected == "s" else 5 * steps.longest
     if expected in period and steps.shortest <= period[expected] <= longest:
         return [expected]
+    if dated:
+        return dated
     usual = [u for u, s in period.items() if u != expected and steps.shortest <= s <= steps.longest]
     possible = _LEAST_S <= period.get(expected, 0.0) <= steps.extreme
     return [expected, *usual] if possible else usual

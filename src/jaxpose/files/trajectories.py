@@ -114,9 +114,9 @@ def read_trajectory(path: Path | str, columns: str | None = None) -> TrajectoryF
     rows = stamped_rows(
         path, table, layout.words, layout.columns, unit=layout.unit, exact=layout.unit_is_stated
     )
-    if layout.only_unit is not None and rows.unit != layout.only_unit:
+    if rows.unit == layout.refused_unit:
         raise DataError(
-            f"{path}: expected timestamps in {layout.only_unit}, as csv of {len(table.words[0])} columns "
+            f"{path}: expected timestamps in {layout.unit}, as csv of {len(table.words[0])} columns "
             f"without a header is EuRoC's or VINS', got {rows.unit}: say what they hold, --columns"
         )
     trajectory, quaternion_xyzw, rows = _poses(path, rows, layout)

@@ -15,7 +15,7 @@ from typing import Annotated, NamedTuple
 
 import tyro
 
-from jaxpose.cli.check.findings import Checked, Fact, Finding
+from jaxpose.cli.check.findings import Checked, Fact, Finding, join
 from jaxpose.errors import DataError
 from jaxpose.experiments.command import Command, execute
 from jaxpose.experiments.outcome import markdown_table
@@ -36,7 +36,14 @@ class Config:
     data: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")] = None
     topics: tuple[str, ...] = ()  # of a ROS bag, those to use before others of their kind
     formats: bool = False  # print which recordings are read, as a table
+    imu_file: Path | None = None  # readings to test by themselves and against the poses of DATA
+    imu_extrinsics: Path | None = None  # of --imu-file: T_body_cam, as in `jaxpose slam`
+    columns: str | None = None  # of a trajectory file that does not say: `t[us] tx ty tz qw qx qy qz`
     json: bool = False  # print all that was found as JSON and nothing else
+
+    def __post_init__(self):
+        if self.imu_extrinsics is not None and self.imu_file is None:
+            raise ValueError("--imu-extrinsics: expected --imu-file FILE with it")
 
 
 class Formats(NamedTuple):
@@ -74,15 +81,32 @@ def run(config: Config, on_update: OnUpdate = silent) -> Result | Formats:
     if path is None:
         raise DataError("expected DATA to check, or --formats for what is read, got neither")
     on_update(Update(f"checking {path}", quiet=True))
+    form, checked = _of_data(path, config)
+    if config.imu_file is not None:
+        from jaxpose.cli.check.inertial import check_beside, poses_of
+
+        truth = poses_of(path, config.columns)
+        checked = join([checked, check_beside(config.imu_file, config.imu_extrinsics, truth)])
+    return Result(path, form, *checked)
+
+
+def _of_data(path: Path, config: Config) -> tuple[str, Checked]:
+    """The format of the data, in words, and what is found in them."""
     if path.is_file() and path.suffix not in (".json", ".npz", ".h5", ".hdf5") and not _is_recording(path):
         from jaxpose.cli.check.trajectory import check_trajectory
 
-        form, checked = check_trajectory(path)
-        return Result(path, f"{form} trajectory", *checked)
+        try:
+            form, checked = check_trajectory(path, config.columns)
+        except DataError:
+            from jaxpose.cli.check.inertial import check_alone
+
+            if (alone := check_alone(path)) is None:
+                raise
+            return "IMU readings", alone
+        return f"{form} trajectory", checked
     if not path.exists():
         raise DataError(f"{path}: expected {_KNOWN}, got nothing")
-    form, checked = _folder(path, config.topics)
-    return Result(path, form, *checked)
+    return _folder(path, config.topics)
 
 
 def main(args: Sequence[str] | None = None, prog: str = "jaxpose check") -> None:

@@ -12,10 +12,11 @@ from jaxpose.cli.check.timestamps import check_stamps, stamps_of
 from jaxpose.cli.check.trajectory import check_read
 from jaxpose.datasets.images import found
 from jaxpose.datasets.rgbd import euroc
+from jaxpose.datasets.rgbd import registry as rgbd_registry
 from jaxpose.datasets.rgbd.euroc_files import existing, read_camera_sheet, sensors
 from jaxpose.datasets.rgbd.imu_csv import ImuFile, read_imu, read_mounting
 from jaxpose.errors import DataError
-from jaxpose.files.trajectories import TrajectoryFile, read_trajectory, since
+from jaxpose.files.trajectories import Trajectory, TrajectoryFile, read_trajectory, since
 from jaxpose.geometry import rigid
 from jaxpose.imu import Imu
 
@@ -64,6 +65,30 @@ def check_beside(file: Path, mounting: Path | None, truth: TrajectoryFile | None
         return check_file(read_imu(file), file.name, truth, R, T_body_cam)
     except (DataError, OSError) as error:
         return unusable(error)
+
+
+def check_alone(file: Path) -> Checked | None:
+    """A file of readings, tested by itself; None for what is none."""
+    try:
+        readings = read_imu(file)
+    except DataError:
+        return None
+    return check_file(readings, file.name, None, None, None)
+
+
+def poses_of(path: Path, columns: str | None) -> TrajectoryFile | None:
+    """The poses of a trajectory file or of a recording, for readings beside it; None where there are none."""
+    try:
+        if path.is_file():
+            return read_trajectory(path, columns)
+        recording = rgbd_registry.load_recording(path)
+    except (DataError, OSError):
+        return None  # the check of the data says why
+    if recording.T_world_cam is None:
+        return None
+    known = np.isfinite(recording.T_world_cam).all((1, 2))
+    poses = Trajectory(recording.t[known], recording.T_world_cam[known], recording.t0_ns)
+    return TrajectoryFile(poses, "TUM", True, (), 0, 0, int(known.sum()))
 
 
 def check_file(

@@ -21,6 +21,7 @@ _UNITS = {
 _OFF_GRAVITY = 0.15  # of the length of mean forces
 _WINDOW_S = 1.0  # over which a body's own acceleration is nothing, for the most part
 _STEADY = 0.4  # quartiles of the means' length, over their median: 0.6 where it is of random vectors
+_LONG_S = 10.0  # over which forces that turn with the body have no mean in the world, but gravity has
 _WEAK = 3.0  # m/s^2: means below it are no gravity
 _TURN_S, _STEP_S = 0.4, 0.02  # between two forces, and of the rotations between them
 _MOST_RATE = 40.0  # rad/s RMS: no gyroscope reads more
@@ -55,6 +56,8 @@ def check_readings(imu: Imu, R_cam_imu: Float[np.ndarray, "3 3"] | None) -> Alon
     omega, force = np.asarray(imu.omega_body), np.asarray(imu.acceleration_body)
     t = np.asarray(imu.t)
     rate, pull = _force(t, omega), _force(t, force)
+    if max(_in_the_world(t, scale * omega, force) for scale in (1.0, np.pi / 180)) < 0.5 * pull.level:
+        pull = pull._replace(spread=np.inf)  # it turns about itself, as a body's own acceleration does
     text = (
         f"median {np.median(np.linalg.norm(omega, axis=1)):.3g} rad/s and {pull.level:.4g} m/s^2 (means of "
     )
@@ -147,6 +150,23 @@ def _turned_error(
     for j in range(k):  # from the middle of one window to that of the next
         turn = turn * Rotation.from_rotvec(rate[first + k // 2 + j] * _STEP_S)
     return float(np.median(np.linalg.norm(smooth[first + k] - turn.inv().apply(smooth[first]), axis=1)))
+
+
+def _in_the_world(
+    t: Float[np.ndarray, " n"], omega: Float[np.ndarray, "n 3"], force: Float[np.ndarray, "n 3"]
+) -> float:
+    """Median length of means over 10 s of forces that are turned into one frame, as the rates say."""
+    grid = np.arange(t[0], t[-1], _STEP_S)
+    if len(grid) < 2:
+        return np.inf
+    rate, pull = _means(t, omega, grid), _means(t, force, grid)
+    k = min(round(_LONG_S / _STEP_S), len(pull))
+    first = np.arange(0, len(pull) - k + 1, k)
+    turn, total = Rotation.identity(len(first)), np.zeros((len(first), 3))
+    for j in range(k):
+        total += turn.apply(pull[first + j])
+        turn = turn * Rotation.from_rotvec(rate[first + j] * _STEP_S)
+    return float(np.median(np.linalg.norm(total, axis=1))) / k
 
 
 def _sign(force_cam: Float[np.ndarray, "n 3"]) -> list[Finding]:
