@@ -256,6 +256,21 @@ def test_what_a_run_leaves(tmp_path):
 
 
 @pytest.mark.slow
+def test_a_shutter_is_known_ignored_or_estimated(tmp_path):
+    """A readout of 0.48 s and an exposure of 0.5 s, of 1.25 s between photographs."""
+    found = {}
+    for shutter in ("known", "ignore", "estimate"):
+        moving = {"line_delay_us": 2e4, "exposure_ms": 500.0, "shutter": shutter}
+        outcome = noisy_nerf.run(smoke(out=tmp_path / shutter, **moving))
+        found[shutter] = outcome.results["shutter"]
+        assert (f"({shutter})" in report(*outcome)) == (shutter != "ignore")
+    assert found["known"] == {"shutter": "known", "line_delay_us": 2e4, "exposure_ms": 500.0}
+    assert found["ignore"] == {"shutter": "ignore", "line_delay_us": 0.0, "exposure_ms": 0.0}
+    assert found["estimate"]["line_delay_us"] != 0 and found["estimate"]["exposure_ms"] != 312.5  # the start
+    assert set(noisy_nerf.load_run(tmp_path / "estimate").state.pose) == {"field", "shutter"}
+
+
+@pytest.mark.slow
 def test_a_study_puts_runs_side_by_side(tmp_path, monkeypatch):
     every = _STUDIES["fields"]
     two = lambda config: {name: every(config)[name] for name in ("per_frame", "bspline")}
@@ -379,6 +394,16 @@ def test_photographs_without_poses(tmp_path):
         (["--noise-sigma", "1"], r"--noise-sigma: has no effect with --noise correlated"),
         (["--data", "nowhere"], r"nowhere: expected a folder of photographs, or orbit, got nothing"),
         (["--resume"], r"--resume: expected --out DIR or --name NAME"),
+        (["--exposure-ms", "-1"], r"--exposure-ms: expected at least 0, got -1"),
+        (["--line-delay-us", "inf"], r"--line-delay-us: expected a finite number, got inf"),
+        (
+            ["--shutter", "ignore"],
+            r"--shutter ignore: expected the orbit with --line-delay-us or",
+        ),
+        (
+            ["--shutter", "estimate", "--pose", "per_frame"],
+            r"expected --pose posenet or bspline, got per",
+        ),
         (["--smoke", "--every", "5"], r"expected at least 4 images to train on, got 2"),
     ],
 )

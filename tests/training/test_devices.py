@@ -22,12 +22,13 @@ STEPS = 200
 SCRIPT = """
 import sys
 import jax
-process, processes, port, out = sys.argv[1:]
+process, processes, port, out, *resumed = sys.argv[1:]
 if int(processes) > 1:
     jax.distributed.initialize(f"localhost:{port}", int(processes), int(process))
 import jax.numpy as jnp
 import numpy as np
 from jaxpose import fields, scenes, training
+from jaxpose.files import checkpoint
 from jaxpose.geometry.camera import Camera
 from jaxpose.training import photometric
 
@@ -49,15 +50,22 @@ trainer = photometric.trainer(
 )
 with jax.set_mesh(training.mesh()):
     state = trainer.start(jax.random.key(0))
-    step = trainer.advance.lower(state, views, STEPS).compile()
-    losses = step(state, views)[1]
+    step = trainer.advance.lower(state, views, STEPS // 2).compile()
+    losses = []
+    if resumed:
+        state = checkpoint.load(resumed[0], state)
+    else:
+        state, first = step(state, views)
+        checkpoint.save(out + ".checkpoint", state)
+        losses.append(np.asarray(first))
+    losses.append(np.asarray(step(state, views)[1]))
 sent = {name: step.as_text().count(f" {name}(") for name in ("all-reduce", "all-gather", "all-to-all")}
-np.savez(out, losses=np.asarray(losses), devices=jax.device_count(), **sent)
+np.savez(out, losses=np.concatenate(losses), devices=jax.device_count(), **sent)
 """.replace("STEPS", str(STEPS))
 
 
-def trained(out, devices, processes=1):
-    """What the script leaves, run on so many devices in so many processes."""
+def trained(out, devices, processes=1, resumed=()):
+    """What the script leaves, run on so many devices in so many processes, anew or from a checkpoint."""
     with socket.create_server(("", 0)) as free:
         port = free.getsockname()[1]
     of_process = devices // processes
@@ -65,7 +73,7 @@ def trained(out, devices, processes=1):
     command = [sys.executable, "-c", SCRIPT]
     started = [
         subprocess.Popen(
-            [*command, str(k), str(processes), str(port), out / f"{devices}-{processes}-{k}.npz"],
+            [*command, str(k), str(processes), str(port), out / f"{devices}-{processes}-{k}.npz", *resumed],
             env=environment,
         )
         for k in range(processes)
@@ -86,6 +94,8 @@ def test_two_devices_and_two_processes_have_the_losses_of_one_device(tmp_path):
         # One sum of all gradients a step, outside the loop over chunks; rays stay where they are.
         assert (found["all-reduce"], found["all-gather"], found["all-to-all"]) == (1, 0, 0)
     assert one["all-reduce"] == 0
+    on_one = trained(tmp_path, 1, resumed=[tmp_path / "2-1-0.npz.checkpoint"])
+    assert_allclose(on_one["losses"], one["losses"][STEPS // 2 :], rtol=1e-4)
 
 
 def test_without_a_mesh_and_with_a_mesh_of_one_device_the_sum_is_the_same():

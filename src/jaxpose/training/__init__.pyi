@@ -1,6 +1,7 @@
 from . import devices as devices
 from . import events as events
 from . import photometric as photometric
+from . import shutter as shutter
 from . import steps as steps
 from .devices import mesh as mesh
 from .events import EventData as EventData
@@ -10,6 +11,8 @@ from .photometric import TrainConfig as TrainConfig
 from .photometric import Viewer as Viewer
 from .photometric import Views as Views
 from .photometric import viewer as viewer
+from .shutter import Shutter as Shutter
+from .shutter import with_shutter as with_shutter
 from .steps import Decay as Decay
 from .steps import State as State
 from .steps import Trainer as Trainer

@@ -1,5 +1,6 @@
 """A radiance field and camera poses optimised together from photographs (Ma et al. 2024, section 4.1)."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -15,6 +16,7 @@ from jaxpose.geometry import se3
 from jaxpose.geometry.camera import Camera, pixel_grid
 from jaxpose.render import Ray, Spacing, pixel_ray
 from jaxpose.scenes import SceneField
+from jaxpose.training.shutter import Shutter, exposure_times
 from jaxpose.training.steps import Trainer, joint, microbatched_sum
 
 Params = Any
@@ -57,6 +59,7 @@ def trainer(
     depths: Depths,
     optimizer: optax.GradientTransformation,
     config: TrainConfig = TrainConfig(),  # noqa: B008 - frozen
+    shutter: Callable[[Params], Shutter] | None = None,
 ) -> Trainer:
     """Minimise the mean squared colour error of random rays, jointly over scene and poses (BARF).
 
@@ -69,14 +72,18 @@ def trainer(
         depths: Where samples lie along the optical axis.
         optimizer: As `joint` takes it.
         config: How many steps, rays and samples.
+        shutter: Of the camera, from the pose field's parameters: a pixel's colour is then the mean of rays
+            from the poses at the instants of its row's exposure. None: all of a photograph is seen at once.
 
     Returns:
         A trainer whose data are `Views`.
     """
 
     def error(scene_params, item):
-        ray, depth, rgb, weight = item
-        return weight * jnp.sum((ray_colour(scene, scene_params, ray, depth)[0] - rgb) ** 2)
+        rays, depth, rgb, weight = item
+        colour = lambda ray: ray_colour(scene, scene_params, ray, depth)[0]
+        seen = colour(rays) if shutter is None else jnp.mean(jax.vmap(colour)(rays), axis=0)
+        return weight * jnp.sum((seen - rgb) ** 2)
 
     total = microbatched_sum(error, min(config.chunk, config.rays))
 
@@ -85,14 +92,19 @@ def trainer(
         count, height, width, _ = views.rgb.shape
         view = jax.random.randint(view_key, (config.rays,), 0, count)
         pixel = _pixels(pixel_key, config.rays, height, width)
-        # Once for every image, not for every ray.
-        T_world_cam = jax.vmap(field.pose, (None, 0))(pose_params, views.t)[view]
-        rays = jax.vmap(partial(pixel_ray, camera))(T_world_cam, pixel.astype(T_world_cam.dtype))
+        at = pixel.astype(views.t.dtype)
+        if shutter is None:  # once for every image, not for every ray
+            T_world_cam = jax.vmap(field.pose, (None, 0))(pose_params, views.t)[view]
+            rays = jax.vmap(partial(pixel_ray, camera))(T_world_cam, at)
+        else:
+            times = jax.vmap(partial(exposure_times, shutter(pose_params), height=height))
+            from_pixel = lambda t, at: pixel_ray(camera, field.pose(pose_params, t), at)
+            rays = jax.vmap(jax.vmap(from_pixel, (0, None)))(times(views.t[view], at[:, 1]), at)
         batch = (
             rays,
             draw_depths(depth_key, depths, rays=config.rays, samples=config.samples),
             _unit(views.rgb[view, pixel[:, 1], pixel[:, 0]]),
-            _weights(views.mask, (view, pixel[:, 1], pixel[:, 0]), T_world_cam.dtype),
+            _weights(views.mask, (view, pixel[:, 1], pixel[:, 0]), at.dtype),
         )
         return _mean(total(scene_params, batch), batch[-1])
 

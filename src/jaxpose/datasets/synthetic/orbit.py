@@ -23,15 +23,21 @@ _SIZE, _RADIUS = 1.1, 1.7
 _HELD_OUT = 10  # views
 _SAMPLES = 2  # per pixel and axis
 _STEPS = 30  # of sphere tracing
+_INSTANTS = 9  # of an exposure
 
 
-def orbit(views: int = 100, width: int = 128, seed: int = 0) -> tuple[Photographs, Photographs]:
+def orbit(
+    views: int = 100, width: int = 128, seed: int = 0, *, line_delay_s: float = 0.0, exposure_s: float = 0.0
+) -> tuple[Photographs, Photographs]:
     """Photographs, white behind, along one turn of a circle that also moves in z.
 
     Args:
         views: To train on; ten more are held out, halfway in time between neighbours.
         width: Of the square images [px].
         seed: Turns and tints the texture; the path is always the same.
+        line_delay_s: From one row to the next [s], of the photographs to train on. A photograph's time is
+            that of its middle row.
+        exposure_s: Of each row of them [s], about the row's time.
 
     Returns:
         Photographs to train on, and those held out.
@@ -45,11 +51,20 @@ def orbit(views: int = 100, width: int = 128, seed: int = 0) -> tuple[Photograph
     train = step * np.arange(views)
     held_out = step * (np.unique(np.linspace(0, views - 2, min(_HELD_OUT, views - 1)).round()) + 0.5)
     lens, texture = camera(width), paint(seed)
-    photograph = jax.jit(lambda T: jnp.round(255 * image(lens, T, texture)).astype(jnp.uint8))
+    to_bytes = lambda rgb: jnp.round(255 * rgb).astype(jnp.uint8)
+    photograph = jax.jit(lambda T: to_bytes(image(lens, T, texture)))
+    exposed = jax.jit(lambda T: to_bytes(exposed_rows(lens, T, texture)))
+    phases = np.array([0.0]) if exposure_s == 0 else (np.arange(_INSTANTS) + 0.5) / _INSTANTS - 0.5
+    row = np.arange(width) - (width - 1) / 2
+    after = line_delay_s * row[:, None] + exposure_s * phases  # [s] the photograph's time
 
     def shots(t, part):
         T_world_cam = orbit_poses(t)
-        rgb = [np.asarray(photograph(jnp.asarray(T, jnp.float32))) for T in T_world_cam]
+        if part == "train" and (line_delay_s or exposure_s):
+            T_of_rows = (orbit_poses((moment + after).ravel()).reshape(*after.shape, 4, 4) for moment in t)
+            rgb = [np.asarray(exposed(jnp.asarray(T, jnp.float32))) for T in T_of_rows]
+        else:
+            rgb = [np.asarray(photograph(jnp.asarray(T, jnp.float32))) for T in T_world_cam]
         files = tuple(f"{part}/{index:03d}.png" for index in range(len(t)))
         notes = (f"synthetic orbit, {len(t)} views of {width} x {width} px, exact poses and timestamps",)
         return Photographs(
@@ -131,6 +146,28 @@ def image(
     direction = direction / jnp.linalg.norm(direction, axis=-1, keepdims=True)
     rgb = jax.vmap(partial(_trace, paint, background, T_world_cam[:3, 3]))(direction)
     return rgb.reshape(camera.height, _SAMPLES, camera.width, _SAMPLES, 3).mean((1, 3))
+
+
+def exposed_rows(
+    camera: Camera, T_world_cam: Float[Array, "h k 4 4"], paint: Float[Array, "6"]
+) -> Float[Array, "h w 3"]:
+    """The object, each row the mean over poses of its own.
+
+    Args:
+        camera: Of the image.
+        T_world_cam: (h, k, 4, 4).
+        paint: Of `paint`.
+
+    Returns:
+        Colours (h, w, 3) in [0, 1].
+    """
+
+    def row(item):
+        number, poses = item
+        strip = camera._replace(cy=camera.cy - number, height=1)
+        return jnp.mean(jax.vmap(lambda T: image(strip, T, paint))(poses), axis=0)[0]
+
+    return jax.lax.map(row, (jnp.arange(camera.height, dtype=T_world_cam.dtype), T_world_cam))
 
 
 def _trace(

@@ -1,7 +1,9 @@
 """What is trained in the noisy-pose experiment: scene, pose field, their rates, by preset and name."""
 
 import warnings
+from collections.abc import Callable
 from dataclasses import asdict, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -10,11 +12,13 @@ from jaxtyping import Array, Float
 from scipy.interpolate import make_splrep
 
 from jaxpose import fields
-from jaxpose.experiments.noisy_nerf.options import Config, Problem
+from jaxpose.datasets.types import Photographs
+from jaxpose.experiments.noisy_nerf.options import ORBIT, Config, Problem
 from jaxpose.experiments.training_loop import CHUNK
 from jaxpose.fields import PoseField, PoseNetConfig
 from jaxpose.scenes import NerfConfig, SceneField, nerf
 from jaxpose.training.photometric import Depths, TrainConfig, Views, trainer
+from jaxpose.training.shutter import Shutter, shutter_of, with_shutter
 from jaxpose.training.steps import Decay, Trainer, adam
 
 _FAST_SCENE = NerfConfig(
@@ -42,6 +46,10 @@ _PER_FRAME_RATES = {  # also of splines; with preset paper BARF's
 _BARF_REFINE = {"depth": 1e-3, "disparity": 3e-3}  # BARF's rate of test-time poses, Blender and LLFF
 
 
+_INSTANTS = 4  # of an exposure
+_SHUTTER_RATE = Decay(1e-2, 1e-3, 0.1)
+
+
 class Model(NamedTuple):
     """A scene and a pose field (camera-to-world), and how to train them."""
 
@@ -52,6 +60,7 @@ class Model(NamedTuple):
     depths: Depths
     views: Views
     trainer: Trainer
+    shutter: Callable[[Any], Shutter] | None  # from the pose field's parameters
     refine_rate: float  # of the test-time pose refinement
 
 
@@ -68,10 +77,14 @@ def build(config: Config, problem: Problem) -> Model:
     scene_rate = Decay(5e-4 if paper and barf == "depth" else 1e-3, 1e-4)
     t = jnp.asarray(photographs.t, jnp.float32)
     rates = _rates(config, problem)
-    optimizer = adam({"scene": scene_rate, "pose": _pose_rates(config, rates, train.steps)}, train.steps)
     start = fields.piecewise_geodesic(t, jnp.asarray(problem.T_start, jnp.float32))
     correct = fields.left_correction if config.side == "world" else fields.right_correction
     field = correct(_correction(config, problem), start)
+    pose_rates = _pose_rates(config, rates, train.steps)
+    shutter = _shutter(config)
+    if config.shutter == "estimate":
+        field, pose_rates, shutter = _estimated_shutter(config, photographs, field, pose_rates)
+    optimizer = adam({"scene": scene_rate, "pose": pose_rates}, train.steps)
     depths = Depths(photographs.near, photographs.far, photographs.spacing)
     return Model(
         scene,
@@ -84,7 +97,8 @@ def build(config: Config, problem: Problem) -> Model:
             jnp.asarray(photographs.rgb),
             None if photographs.mask is None else jnp.asarray(photographs.mask),
         ),
-        trainer(scene, field, photographs.camera, depths, optimizer, train),
+        trainer(scene, field, photographs.camera, depths, optimizer, train, shutter),
+        shutter,
         _BARF_REFINE[barf],
     )
 
@@ -125,6 +139,22 @@ def describe(config: Config, model: Model) -> dict[str, Any]:
     }
 
 
+def found_shutter(config: Config, model: Model, pose_params: Any) -> dict[str, Any]:
+    """Line delay and exposure that a training has used, and where they are from.
+
+    Args:
+        config: Of the run.
+        model: Its model.
+        pose_params: The trained pose field's parameters.
+
+    Returns:
+        `line_delay_us`, `exposure_ms` and `shutter`; zeros where photographs are seen at once.
+    """
+    shutter = Shutter(0.0, 0.0) if model.shutter is None else model.shutter(pose_params)
+    line_delay, exposure = float(shutter.line_delay), abs(float(shutter.exposure))
+    return {"shutter": config.shutter, "line_delay_us": 1e6 * line_delay, "exposure_ms": 1e3 * exposure}
+
+
 def _correction(config: Config, problem: Problem) -> PoseField:
     """The correction of the poses by itself."""
     photographs = problem.train
@@ -139,6 +169,34 @@ def _correction(config: Config, problem: Problem) -> PoseField:
     if config.pose == "bspline":
         return fields.bspline(span, config.spline_knots)
     return fields.per_frame_poses(photographs.t)
+
+
+def _shutter(config: Config) -> Callable[[Any], Shutter] | None:
+    """The camera's, as it is known; None: a photograph is seen at once."""
+    if config.shutter == "ignore" or not (config.line_delay_us or config.exposure_ms):
+        return None
+    instants = _INSTANTS if config.exposure_ms else 1
+    return lambda params: Shutter(1e-6 * config.line_delay_us, 1e-3 * config.exposure_ms, instants)
+
+
+def _estimated_shutter(
+    config: Config, photographs: Photographs, field: PoseField, pose_rates: Any
+) -> tuple[PoseField, Any, Callable[[Any], Shutter]]:
+    """The field with a shutter among its parameters, their rates, and where it is among them.
+
+    The units are those in which a readout and an exposure as long as the time between photographs are one.
+    """
+    between = float(np.median(np.diff(photographs.t)))
+    units = between / photographs.camera.height, between
+    from_nothing = 0.0, between / 4  # the gradient of an exposure is zero at zero
+    given = 1e-6 * config.line_delay_us, 1e-3 * config.exposure_ms or from_nothing[1]
+    start = Shutter(*(from_nothing if config.data == ORBIT else given), _INSTANTS)
+    both = with_shutter(field, start, units)
+    return (
+        both,
+        {"field": pose_rates, "shutter": _SHUTTER_RATE},
+        partial(shutter_of, both, instants=_INSTANTS),
+    )
 
 
 def _rates(config: Config, problem: Problem) -> dict[str, Decay]:

@@ -16,12 +16,19 @@ from jaxpose.datasets.synthetic import pose_noise
 from jaxpose.datasets.synthetic.orbit import DIAMETER, orbit
 from jaxpose.datasets.types import Photographs, every, take
 from jaxpose.errors import DataError
-from jaxpose.experiments.checks import check_least, check_positive, check_run_folder, check_unused
+from jaxpose.experiments.checks import (
+    check_finite,
+    check_least,
+    check_positive,
+    check_run_folder,
+    check_unused,
+)
 from jaxpose.experiments.devices import DeviceConfig, Precision, check_devices
 from jaxpose.experiments.training_loop import CHUNK, NetConfig
 from jaxpose.geometry import rigid
 
 Pose = Literal["posenet", "per_frame", "bspline", "spline_reset"]
+ShutterMode = Literal["known", "estimate", "ignore"]
 Study = Literal["fields", "encoding", "size", "spline", "ablations"]
 ORBIT = Path("orbit")
 _FAR = 100.0  # times the cameras' extent: a world so far from its origin is worked on near it
@@ -60,6 +67,13 @@ class Config:
     focal_px: float | None = None  # [px] of images alone, as they are on disk; None: what their EXIF says
     image_width: int | None = None  # [px] images are reduced to; None: 100, with preset paper 400
     orbit_views: int = 100  # photographs of the object that is made on the fly
+    # [us] from a row to the next, [ms] of each row, both about the middle row's middle, which a photograph's
+    # time is. The orbit is photographed so; of other data it is what the camera has.
+    line_delay_us: float = 0.0
+    exposure_ms: float = 0.0
+    # Each ray from the poses of its own row's exposure; "estimate": both numbers are found, from nothing on
+    # the orbit, else from those given; "ignore": the orbit is trained as if it had neither.
+    shutter: ShutterMode = "known"
     seed: int = 0  # of the noise, the network's start, the rays
     steps: int | None = None  # None: 5000, with preset paper 200,000
     rays: int | None = None  # per step; None: 1024, with preset paper 4096
@@ -91,6 +105,18 @@ class Config:
         check_run_folder(self, None if self.data == ORBIT else self.data)
         check_devices(self)
         self._check_unused()
+        self._check_shutter()
+
+    def _check_shutter(self):
+        check_finite(self, "line_delay_us")
+        check_least(self, exposure_ms=0)
+        given = self.line_delay_us != 0 or self.exposure_ms != 0
+        if self.shutter == "ignore" and (self.data != ORBIT or not given):
+            raise ValueError("--shutter ignore: expected the orbit with --line-delay-us or --exposure-ms")
+        moves = self.shutter == "estimate" or (given and self.shutter == "known")
+        if moves and (self.study is not None or self.pose not in ("posenet", "bspline")):
+            found = self.pose if self.study is None else f"--study {self.study}"
+            raise ValueError(f"--shutter {self.shutter}: expected --pose posenet or bspline, got {found}")
 
     def _check_unused(self):
         if self.noise != "correlated":
@@ -167,7 +193,9 @@ def load(config: Config) -> Problem:
 def _photographs(config: Config) -> tuple[Photographs, Photographs]:
     width = _SMOKE_WIDTH if config.smoke else config.image_width or _WIDTHS[config.preset]
     if config.data == ORBIT:
-        return orbit(_SMOKE_VIEWS if config.smoke else config.orbit_views, width)
+        line_delay_s, exposure_s = 1e-6 * config.line_delay_us, 1e-3 * config.exposure_ms
+        views = _SMOKE_VIEWS if config.smoke else config.orbit_views
+        return orbit(views, width, line_delay_s=line_delay_s, exposure_s=exposure_s)
     if not config.data.exists():
         raise DataError(f"{config.data}: expected a folder of photographs, or orbit, got nothing")
     train, held_out = load_photographs(config.data, width=width, focal_px=config.focal_px)

@@ -26,7 +26,7 @@ from jaxpose.experiments import devices, training_loop
 from jaxpose.experiments.command import MODULE, Command, execute
 from jaxpose.experiments.devices import Job
 from jaxpose.experiments.noisy_nerf.evaluation import PROTOCOL, UNPOSED_PROTOCOL, Measured, measure
-from jaxpose.experiments.noisy_nerf.model import Model, build, describe, splined
+from jaxpose.experiments.noisy_nerf.model import Model, build, describe, found_shutter, splined
 from jaxpose.experiments.noisy_nerf.options import (
     GROUPS,
     ORBIT,
@@ -165,6 +165,7 @@ def _single(
         data=problem.metadata,
         training=describe(config, model),
         protocol=PROTOCOL if measured.posed else UNPOSED_PROTOCOL,
+        shutter=found_shutter(config, model, trained.state.pose),
         **measured.numbers,
     )
     atomic.write_json(finished, results)  # last: with it the run counts as finished

@@ -86,6 +86,12 @@ def report(folder: Path, results: dict[str, Any]) -> str:
             f"LPIPS {number(run['lpips'], 3)}"
             for label, run in refined.items()
         ),
+        *(
+            f"  shutter      {label}: {run['shutter']['line_delay_us']:.1f} us a row, exposure "
+            f"{run['shutter']['exposure_ms']:.2f} ms ({run['shutter']['shutter']})"
+            for label, run in runs.items()
+            if run["shutter"]["line_delay_us"] or run["shutter"]["exposure_ms"]
+        ),
         f"  cost         {cost_text(results)}",
         f"  written to   {folder}",
     ]
