@@ -200,8 +200,7 @@ def viewer(
             )
             return _mean(total((), batch), batch[-1])
 
-        still = jnp.zeros(6, T_world_cam.dtype)
-        twist = optim.minimize(loss, still, refine_optimizer, refine_steps).params
+        twist = optim.minimize(loss, jnp.zeros(6, T_world_cam.dtype), refine_optimizer, refine_steps).params
         return se3.compose(se3.exp(twist), T_world_cam)
 
     return Viewer(jax.jit(image), jax.jit(refine_pose))
