@@ -13,14 +13,14 @@ from jaxpose.experiments.command import Command, parse
 from jaxpose.experiments.option_help import Option, options
 from jaxpose.experiments.ranges import check_ranges, range_of
 
-SIGNED = {"imu_offset_s", "time_offset_s", "room.gravity_world", "slam.line_delay_us"}
+SIGNED = {"imu_offset_s", "time_offset_s", "room.gravity_world", "slam.line_delay_us", "line_delay_us"}
 # Numbers of which none, or 0, is a choice.
 ZERO_IS_ONE = SIGNED | {
     "start", "slam.seed", "room.seed", "seed", "slam.field.octaves", "net.octaves", "posenet_octaves",
     "net.window", "slam.track.edge", "slam.map.edge", "slam.track.colour_weight", "slam.track.dof_weight",
     "slam.track.minimum_valid", "slam.track.sample.front", "slam.track.sample.behind",
     "slam.map.sample.front", "slam.map.sample.behind", "slam.hold_out", "slam.keyframe_overlap",
-    "room.line_delay_us",
+    "room.line_delay_us", "exposure_ms",
     "room.depth_noise", "noise_translation", "noise_rotation_deg", "noise_sigma", "test_pose_steps",
     "axis_offset_deg", "max_difference_s", "port", "frustums", "devices.process",
     *(f"{of}.imu_noise.{name}" for of in ("slam", "room") for name in
