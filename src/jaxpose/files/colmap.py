@@ -296,6 +296,8 @@ def _text_images(file: Path) -> Iterator[tuple[Any, ...]]:
         _, *pose, camera, name = line.split(maxsplit=9)
         points = np.array(next(lines, "").split()[2::3], np.int64)  # the line of matches may be empty
         numbers = [float(word) for word in pose]
+        if len(numbers) != 7:
+            raise ValueError(f"{line[:60]!r}, not a number, a pose, a camera and a name")
         yield name.strip(), int(camera), numbers[:4], numbers[4:], points[points >= 0].tolist()
 
 

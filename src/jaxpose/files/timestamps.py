@@ -39,7 +39,7 @@ def to_decimal(word: str) -> Decimal | None:
         number = Decimal(word)
     except InvalidOperation:
         return None
-    return number if number.is_finite() and abs(number) < _LARGEST else None
+    return number if number.is_finite() and -_LARGEST < number < _LARGEST else None
 
 
 def to_ns(number: Decimal, unit: Unit) -> int:

@@ -259,7 +259,7 @@ def _poses(file: Path, frames: list[dict[str, Any]]) -> Float[np.ndarray, "n 4 4
     for index, frame in enumerate(frames):
         try:
             matrix = np.array(frame.get("transform_matrix"), np.float64)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             matrix = np.empty(0)
         if matrix.shape not in ((3, 4), (4, 4)):
             raise DataError(
