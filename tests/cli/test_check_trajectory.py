@@ -5,9 +5,12 @@ import json
 import numpy as np
 import pytest
 from helpers.checks import AROUND, FLIP, T0, checked, faults, flipped, inverted, named_tests, write_rows
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial.transform import Rotation
 
 from jaxpose.cli import main as main_command
 from jaxpose.cli.check.command import exit_code
+from jaxpose.cli.check.poses import Quaternions, check_poses
 from jaxpose.files import trajectories
 
 
@@ -100,3 +103,18 @@ def test_the_command_ends_with_its_code(tmp_path, capsys):
             main_command.main(["check", str(path)])
         line = str(stop.value)
         assert line.startswith("jaxpose check: ") and line.endswith(f"got {found}") and "\n" not in line
+
+
+def test_random_motions_raise_no_alarm_about_quaternions():
+    """Smooth rotations and positions that have nothing to do with each other, in the order of the format."""
+    alarms = 0
+    for seed in range(120):
+        rng = np.random.default_rng(seed)
+        slow = rng.uniform(5, 60)
+        smooth = lambda: gaussian_filter1d(rng.normal(size=(400, 3)), slow, axis=0) * slow**0.5  # noqa: B023
+        R = Rotation.from_rotvec(smooth() * rng.uniform(0.2, 2)) * Rotation.random(rng=rng)
+        T = np.tile(np.eye(4), (400, 1, 1))
+        T[:, :3, :3], T[:, :3, 3] = R.as_matrix(), smooth() * rng.uniform(0.2, 2)
+        found = check_poses(np.arange(400) / 20, T, Quaternions(R.as_quat(), "xyzw"))
+        alarms += any(f.test == "quaternion order" and f.severity != "ok" for f in found.findings)
+    assert alarms == 0

@@ -14,6 +14,8 @@ _JUMP = 10.0  # times what 95% of the steps stay below
 _LEAST_TURN = 0.2  # rad between some two poses, for their order to show
 _SIGN_FLIPS = 3  # of quaternions, without which nothing made one column positive
 _MORE_EXPLAINED = 0.15  # share of the positions' variance
+_BY_CHANCE = 5.2  # over the times that the positions cross their mean: independent motions stay below it
+_SURE, _LEFT = 0.8, 3.0  # a share that tells by itself, if the given order leaves so many times more
 _MOST = 2000  # poses looked at
 _OFF_NORM = 1e-2
 
@@ -109,7 +111,9 @@ def _other_order(T: Float[np.ndarray, "n 4 4"], written: Quaternions, other: Ord
     turn = rigid.rotation_angle(some[0, :3, :3], some[:, :3, :3])
     if turn.max() > _LEAST_TURN and np.ptp(T[:, :3, 3], axis=0).any():
         given, meant = _explained(some), _explained(reorder(some, written.order))
-        if meant > given + _MORE_EXPLAINED:
+        chance = _BY_CHANCE / max(_crossings(T), 1)
+        sure = meant > _SURE and 1 - given > _LEFT * (1 - meant)
+        if meant > given + _MORE_EXPLAINED and (sure or meant > chance):
             reasons.append(
                 f"turning about one point then explains {meant:.0%} of the positions, not {given:.0%}"
             )
@@ -122,3 +126,9 @@ def _explained(T: Float[np.ndarray, "n 4 4"]) -> float:
     wanted = T[:, :3, 3].reshape(-1)
     left = wanted - design @ np.linalg.lstsq(design, wanted, rcond=None)[0]
     return 1 - float(left @ left / ((T[:, :3, 3] - T[:, :3, 3].mean(0)) ** 2).sum())
+
+
+def _crossings(T: Float[np.ndarray, "n 4 4"]) -> float:
+    """How often the positions cross their mean, over the axes: about as many samples are independent."""
+    centred = T[:, :3, 3] - T[:, :3, 3].mean(0)
+    return float((np.diff(np.sign(centred), axis=0) != 0).sum(0).mean())
