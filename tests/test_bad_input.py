@@ -172,7 +172,7 @@ CALLS = {
     "every": (lambda: datasets.every(PHOTOGRAPHS, 0), "expected a step of at least 1, got 0"),
     "load_recording": (
         lambda: datasets.load_recording("nowhere"),
-        "nowhere: expected a folder of .*, got nothing",
+        "nowhere: expected a .*, got nothing",
     ),
     "load_events": (
         lambda: datasets.load_events("nowhere"),

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from jaxpose._checks import check_increasing, check_shapes
-from jaxpose.datasets.photos.lens import Lens
+from jaxpose.datasets.lens import Lens
 from jaxpose.errors import DataError
 from jaxpose.events import Events, Mosaic
 from jaxpose.geometry.camera import Camera

@@ -8,9 +8,9 @@ from jaxtyping import Float
 from jaxpose.cli.check.findings import Checked, Fact, Finding, join, unusable
 from jaxpose.cli.check.poses import check_poses
 from jaxpose.cli.check.recording import check_camera
+from jaxpose.datasets.lens import as_camera
 from jaxpose.datasets.photos import blender, colmap, registry
 from jaxpose.datasets.photos.common import OPENGL
-from jaxpose.datasets.photos.lens import as_camera
 from jaxpose.datasets.types import Photographs
 from jaxpose.errors import DataError
 from jaxpose.files.colmap import read_colmap

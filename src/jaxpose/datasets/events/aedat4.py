@@ -24,7 +24,8 @@ def aedat4_stream(file: Path) -> Stream:
                 if packet["stream_id"] == first and "events" in packet:
                     events = packet["events"]
                     # Views of the packet's own structure: copied, so that it can be let go.
-                    yield Block(*(events[name].copy() for name in ("t", "x", "y")), events["on"].astype("i1"))
+                    t, x, y = (events[name].copy() for name in ("t", "x", "y"))
+                    yield Block(t, x, y, events["on"].astype("i1"))
         except (RuntimeError, ValueError) as error:
             raise DataError(f"{file}: expected a whole AEDAT 4 file, got {_words(error)}") from None
 

@@ -151,4 +151,5 @@ def _latest(states: np.ndarray, value: np.ndarray, before: int) -> tuple[np.ndar
 def _set_bits(masks: np.ndarray, width: int) -> tuple[np.ndarray, Any]:
     """Rows and places of the bits that are set, from the lowest, row by row."""
     octets = masks.astype("<u4").view(np.uint8).reshape(-1, 4)[:, : -(-width // 8)]
-    return np.nonzero(np.unpackbits(octets, axis=1, bitorder="little"))
+    row, place = np.nonzero(np.unpackbits(octets, axis=1, bitorder="little"))
+    return row, place

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxpose.datasets.images import natural_order
+from jaxpose.datasets.lens import Lens
 from jaxpose.datasets.photos.common import (
     OPENGL,
     Depths,
@@ -19,7 +20,6 @@ from jaxpose.datasets.photos.common import (
     guessed_depths,
     held_out_rows,
 )
-from jaxpose.datasets.photos.lens import Lens
 from jaxpose.datasets.photos.names import finder
 from jaxpose.datasets.photos.pixels import Mask, read_views, stored_size
 from jaxpose.datasets.photos.transforms_keys import (

@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxpose.datasets.images import natural_order, some
+from jaxpose.datasets.lens import Lens, from_colmap, resized
 from jaxpose.datasets.photos.common import Depths, frame_numbers, guessed_depths, held_out_rows
-from jaxpose.datasets.photos.lens import Lens, from_colmap, resized
 from jaxpose.datasets.photos.names import finder
 from jaxpose.datasets.photos.pixels import Mask, read_views, stored_size
 from jaxpose.datasets.types import Photographs, take

@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxpose.datasets.images import SUFFIXES, image_size
+from jaxpose.datasets.lens import from_camera
 from jaxpose.datasets.photos.common import OPENGL, check_poses, frame_numbers
-from jaxpose.datasets.photos.lens import from_camera
 from jaxpose.datasets.photos.pixels import read_images
 from jaxpose.datasets.types import Photographs, take
 from jaxpose.errors import DataError

@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from PIL import ExifTags, Image, ImageOps
 
+from jaxpose.datasets import lens
 from jaxpose.datasets.images import image_size, open_image, some
-from jaxpose.datasets.photos import lens
-from jaxpose.datasets.photos.lens import WIDEST_DEG, Lens
+from jaxpose.datasets.lens import WIDEST_DEG, Lens
 from jaxpose.errors import DataError
 from jaxpose.geometry import camera
 from jaxpose.geometry.camera import Camera

@@ -8,8 +8,8 @@ import numpy as np
 from PIL import ExifTags, Image
 
 from jaxpose.datasets.images import open_image, some
+from jaxpose.datasets.lens import Lens, lens
 from jaxpose.datasets.photos.common import frame_numbers
-from jaxpose.datasets.photos.lens import Lens, lens
 from jaxpose.datasets.photos.names import images_in
 from jaxpose.datasets.photos.pixels import Mask, read_views, stored_size
 from jaxpose.datasets.types import Photographs, take

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from jaxpose.datasets.lens import ORDER, Lens, from_camera
 from jaxpose.datasets.photos.common import OPENGL
-from jaxpose.datasets.photos.lens import ORDER, Lens, from_camera
 from jaxpose.datasets.types import Photographs
 from jaxpose.errors import DataError
 from jaxpose.files.atomic import write_json

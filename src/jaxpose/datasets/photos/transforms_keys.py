@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxpose.datasets.images import some
-from jaxpose.datasets.photos.lens import Kind, Lens, lens
+from jaxpose.datasets.lens import Kind, Lens, lens
 from jaxpose.errors import DataError
 from jaxpose.files.untrusted import read_json
 

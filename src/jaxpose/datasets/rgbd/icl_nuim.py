@@ -1,5 +1,6 @@
 """ICL-NUIM's RGB-D layout: `associations.txt` lists numbered images, `groundtruth.txt` the true poses."""
 
+import re
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,7 +22,7 @@ from jaxpose.datasets.rgbd.frames import Listing, Poses, of_files
 from jaxpose.datasets.types import Recording
 from jaxpose.errors import DataError
 from jaxpose.files.tables import numbered_lines
-from jaxpose.files.trajectories import read_tum
+from jaxpose.files.trajectories import read_tum, since
 from jaxpose.imu import GRAVITY_WORLD
 
 _LIST, _TRUTH, _PUBLISHED_TRUTH = "associations.txt", "groundtruth.txt", "*.gt.freiburg"
@@ -118,7 +119,9 @@ def _parse(line: str) -> _Pair | None:
         return None
     frame, first, same, second = words
     is_depth = ["depth" in name.lower() for name in (first, second)]
-    if not frame.isdecimal() or not same.isdecimal() or int(frame) != int(same) or sum(is_depth) != 1:
+    if not all(re.fullmatch("[0-9]{1,9}", x) for x in (frame, same)) or sum(is_depth) != 1:
+        return None
+    if int(frame) != int(same):
         return None
     depth, color = (first, second) if is_depth[0] else (second, first)
     return _Pair(int(frame), color, depth)
@@ -163,9 +166,9 @@ def _read_poses(folder: Path, numbers: list[int]) -> Poses:
         file = only(candidates, folder, f"{_TRUTH} or one {_PUBLISHED_TRUTH}")
     ground_truth = read_tum(file)
     stated: dict[int, Float[np.ndarray, "4 4"]] = {}
-    for (line, _), frame, pose in zip(numbered_lines(file), ground_truth.t, ground_truth.T, strict=True):
+    for frame, pose in zip(since(ground_truth, 0), ground_truth.T, strict=True):
         if frame != int(frame):
-            raise DataError(f"{file}:{line}: expected a frame number, got {frame}")
+            raise DataError(f"{file}: expected frame numbers, got {frame}")
         stated[int(frame)] = _MIRROR @ pose @ _MIRROR
     none = np.full((4, 4), np.nan)
     poses = np.stack([stated.get(number, none) for number in numbers])

@@ -17,9 +17,9 @@ import imageio.v3 as imageio
 import numpy as np
 from jaxtyping import Float
 
+from jaxpose.datasets.lens import as_camera
 from jaxpose.datasets.origin import moved
 from jaxpose.datasets.photos import blender
-from jaxpose.datasets.photos.lens import as_camera
 from jaxpose.datasets.photos.registry import find_format, images_folder
 from jaxpose.datasets.photos.transforms_json import stated, write_transforms
 from jaxpose.experiments import devices, training_loop

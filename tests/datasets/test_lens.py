@@ -6,8 +6,8 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from jaxpose.datasets.photos import lens as lenses
-from jaxpose.datasets.photos.lens import as_camera, from_colmap, lens, pinhole_for, project
+from jaxpose.datasets import lens as lenses
+from jaxpose.datasets.lens import as_camera, from_colmap, lens, pinhole_for, project
 from jaxpose.datasets.photos.pixels import read_views
 from jaxpose.errors import DataError
 from jaxpose.files.colmap import MODELS, ColmapCamera
