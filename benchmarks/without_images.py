@@ -1,7 +1,7 @@
 """Seconds without images: how far a run with an IMU is off in them, and one second after.
 
 Options are those of `python -m jaxpose.experiments.imu_slam`. From 10 s on, for 3 s, frames are black and
-without depth. Printed are distances to the true positions without any alignment: the run starts at the true pose.
+without depth. Printed are distances to the true positions, not aligned: the run starts at the true pose.
 
     python benchmarks/without_images.py --help
 """

@@ -44,5 +44,5 @@ def test_what_is_no_video_is_one_line(tmp_path, monkeypatch):
     with pytest.raises(DataError, match="b.mp4: expected a video"):
         Video(tmp_path / "b.mp4")
     monkeypatch.setitem(__import__("sys").modules, "av", None)
-    with pytest.raises(DataError, match=r'needs the package av: pip install "jaxpose\[video\]"'):
+    with pytest.raises(DataError, match=r'needs the package av: pip install -e ".\[video\]"'):
         Video(path)

@@ -298,7 +298,7 @@ def test_imu_is_simulated_before_thinning(folder):
         (["--track.method", "gradient", "--field.activation", "relu"], r"expected softplus"),
         (["--name", "x"], r"--name: expected no --out with it"),
         (["--imu-offset-s", "nan"], r"--imu-offset-s: expected a finite number"),
-        (["--data", "nowhere"], r"nowhere: expected a folder of frame-NNNNNN.*got nothing"),
+        (["--data", "nowhere"], r"nowhere: expected a recording .*7-Scenes.*got nothing"),
     ],
 )
 def test_bad_options_are_one_line(args, expected, tmp_path):

@@ -379,6 +379,7 @@ _EVENTS = {"event_npz": _event_npz, "event_hdf5": _event_hdf5, "davis": _davis, 
 _CHECKED = {**_RECORDINGS, "blender": _blender, "llff": _llff, "event_npz": _event_npz}
 _tum_file = partial(_table, trajectories.write_tum)
 _euroc_file = partial(_table, trajectories.write_euroc)
+_ANY_FILE = _of("a.txt", lambda file: trajectories.read_trajectory(file).trajectory)
 _kitti_file = partial(_table, lambda file, trajectory: trajectories.write_kitti(file, trajectory.T))
 
 TARGETS = {
@@ -407,8 +408,10 @@ TARGETS = {
     "ply_binary": Target(partial(_ply, False), _points),
     "tum_file": Target(_tum_file, _of("a.txt", trajectories.read_tum)),
     "euroc_file": Target(_euroc_file, _of("a.txt", trajectories.read_euroc)),
-    "kitti_file": Target(_kitti_file, _of("a.txt", trajectories.read_kitti)),
-    "any_file": Target(_tum_file, _of("a.txt", lambda file: trajectories.read_trajectory(file).trajectory)),
+    "kitti_file": Target(
+        _kitti_file, _of("a.txt", lambda file: trajectories.read_trajectory(file).trajectory)
+    ),
+    "any_file": Target(_tum_file, _ANY_FILE),
     "check_file": Target(_tum_file, _unseen(_of("a.txt", lambda file: check.run(check.Config(file))))),
     "timestamps": Target(_tum_file, _of("a.txt", trajectories.read_timestamps)),
     "camchain": Target(_camchain, _of("a.yaml", read_mounting)),

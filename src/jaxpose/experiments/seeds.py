@@ -140,7 +140,7 @@ def _pool(config: Config) -> Iterator[Executor]:
     try:
         from distributed import Client  # pyright: ignore[reportMissingImports]
     except ImportError:
-        raise DataError('--scheduler: expected Dask, pip install "jaxpose[cluster]", got none') from None
+        raise DataError('--scheduler: expected Dask, pip install -e ".[cluster]", got none') from None
     try:
         client = Client(config.scheduler, timeout=_CONNECT_S)
     except (OSError, ValueError) as error:

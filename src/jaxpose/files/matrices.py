@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxpose.errors import DataError
+from jaxpose.files.schema import FARTHEST_M
 from jaxpose.files.tables import read_numbers, read_table
 from jaxpose.geometry import rigid
 
@@ -24,8 +25,13 @@ def orthonormal(T: Float[np.ndarray, "n 4 4"], where: Callable[[int], str]) -> F
         Poses (n, 4, 4).
 
     Raises:
-        DataError: With `where(i)` for the worst, pose i, if it is more than rounding off a rotation.
+        DataError: With `where(i)` for the worst, pose i, if it is more than rounding off a rotation or
+            farther than 1e9 m away.
     """
+    away = np.abs(T[:, :3, 3]).max(axis=1)
+    if away.max() > FARTHEST_M:
+        i = int(away.argmax())
+        raise DataError(f"{where(i)}: expected a position up to {FARTHEST_M:g} m, got {T[i, :3, 3]}")
     rotation = rigid.nearest_rotation(T[:, :3, :3])
     off = np.abs(T[:, :3, :3] - rotation).max(axis=(1, 2))
     if off.max() > _MOST_OFF_ROTATION:

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxpose.errors import DataError
+from jaxpose.files.schema import FARTHEST_M
 from jaxpose.files.timestamps import PER_SECOND, POSES, Steps, Unit, format_ns, to_decimal, to_ns, units
 
 _NO_NUMBER = {"", "nan", "-nan", "null", "none", "na", "n/a"}  # how writers say that there is none
@@ -148,6 +149,9 @@ def _numbers(
         if None in values or (timestamp is None and _number(words[at[0]]) is None):
             raise DataError(f"{path}:{number}: expected {columns}, got {' '.join(words)[:60]!r}")
         kept = [value for value in values if value is not None and math.isfinite(value)]
+        if any(abs(value) > FARTHEST_M for value in kept):
+            got = max(kept, key=abs)
+            raise DataError(f"{path}:{number}: expected {columns}, none above {FARTHEST_M:g}, got {got:g}")
         if timestamp is None or len(kept) < len(values):
             missing.append(number)
         else:

@@ -141,7 +141,7 @@ LINE = r"associations.txt:2: expected N depth/N.png N rgb/N.png \(or rgb before 
         ),
         (TRUTH, "1 2 3\n", rf"{TRUTH}:1: expected 8 numbers \(t tx ty tz qx qy qz qw\), got 3"),
         (TRUTH, "1 0 0 x 0 0 0 1\n", f"{TRUTH}:1: expected 8 numbers"),
-        (TRUTH, "# a\n1 0 0 0 0 0 0 1\n1.5 0 0 0 0 0 0 1\n", f"{TRUTH}:3: expected a frame number, got 1.5"),
+        (TRUTH, "# a\n1 0 0 0 0 0 0 1\n1.5 0 0 0 0 0 0 1\n", f"{TRUTH}: expected frame numbers, got 1.5"),
         (TRUTH, "1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", f"{TRUTH}:2: expected a timestamp"),
         ("camera-intrinsics.txt", "30 0 15\n0 -31 11\n0 0 1\n", "intrinsics.txt: expected fx 0 cx.*0 -31 11"),
         ("rgb/0.png", "text", "rgb/0.png: expected an image, got cannot identify"),

@@ -177,7 +177,7 @@ def test_an_encrypted_archive_is_one_line(tmp_path, walk):
 def test_without_lzfse_the_extra_is_named(tmp_path, walk, monkeypatch):
     path = phones.record3d(tmp_path / "a.r3d", walk)
     monkeypatch.setitem(__import__("sys").modules, "lzfse", None)
-    with pytest.raises(DataError, match=r'needs the package lzfse: pip install "jaxpose\[phone\]"'):
+    with pytest.raises(DataError, match=r'needs the package lzfse: pip install -e ".\[phone\]"'):
         record3d.load(path)
 
 

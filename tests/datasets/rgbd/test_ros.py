@@ -378,5 +378,5 @@ def test_without_the_package_the_extra_is_named(tmp_path, walk, monkeypatch):
     make = Maker("ros1")
     path = make.write(tmp_path, messages(make, walk))
     monkeypatch.setitem(__import__("sys").modules, "rosbags.highlevel", None)
-    with pytest.raises(DataError, match=r'needs the package rosbags: pip install "jaxpose\[ros\]"'):
+    with pytest.raises(DataError, match=r'needs the package rosbags: pip install -e ".\[ros\]"'):
         ros.load(path)

@@ -49,7 +49,7 @@ def read_listing(folder: Path) -> tuple[list[int], list[Path]]:
 def read_imu_sheet(file: Path) -> tuple[ImuNoise, Float[np.ndarray, "4 4"]]:
     """Noise densities and the pose of the IMU on the body."""
     content = _sheet(file)
-    scalar = lambda key: float(numbers(file, content, key, above=0, most=_LOUDEST))
+    scalar = lambda key: float(numbers(file, content, key, least=0, most=_LOUDEST))
     noise = ImuNoise(
         gyro_density=scalar("gyroscope_noise_density"),
         accelerometer_density=scalar("accelerometer_noise_density"),

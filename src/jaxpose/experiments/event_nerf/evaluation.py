@@ -71,7 +71,7 @@ def find_truth(problem: Problem) -> GroundTruth | None:
     if len(during) < 3:
         return None
     at = during[np.unique(np.linspace(0, len(during) - 1, min(len(during), _MOST_POSES)).round().astype(int))]
-    start = piecewise_geodesic(*(jnp.asarray(x, jnp.float32) for x in problem.start))
+    start = piecewise_geodesic(*(jnp.asarray(x, jnp.float32) for x in problem.start[:2]))
     T_start = jax.jit(jax.vmap(partial(start.pose, {})))(jnp.asarray(recording.t[at], jnp.float32))
     return GroundTruth(recording.t[at], recording.T_world_cam[at], np.asarray(T_start, np.float64))
 

@@ -113,7 +113,7 @@ def _preset(config: Config, problem: Problem) -> Preset:
 
 def _field(config: Config, problem: Problem, plan: Preset) -> tuple[PoseField, dict[str, Decay]]:
     """The trajectory as a field, and the rates of its parameters."""
-    initial = fields.piecewise_geodesic(*(jnp.asarray(x, jnp.float32) for x in problem.start))
+    initial = fields.piecewise_geodesic(*(jnp.asarray(x, jnp.float32) for x in problem.start[:2]))
     if config.pose == "linear":
         return initial, {}
     net = replace(config.net, layers=2, width=32) if config.smoke else config.net
