@@ -54,7 +54,9 @@ def test_interrupted_while_it_is_loading():
         lines.append(process.communicate()[1].splitlines())
         assert process.returncode != 0
     assert any(one and one[-1] == "jaxpose slam: interrupted" for one in lines), lines
-    assert all(len([line for line in one if not line.startswith("  ")]) == 1 for one in lines[1:]), lines
+    # JAX swallows what is raised while its own callback collects garbage; the run then goes on to its end.
+    said = [one for one in lines[1:] if not any("_xla_gc_callback" in line for line in one)]
+    assert all(len([line for line in one if not line.startswith("  ")]) == 1 for one in said), lines
 
 
 def test_names_that_no_terminal_shows_are_escaped(tmp_path, capsys):

@@ -56,7 +56,7 @@ with jax.set_mesh(training.mesh()):
         state = checkpoint.load(resumed[0], state)
     else:
         state, first = step(state, views)
-        checkpoint.save(out + ".checkpoint", state)
+        checkpoint.save(out + ".checkpoint.npz", state)
         losses.append(np.asarray(first))
     losses.append(np.asarray(step(state, views)[1]))
 sent = {name: step.as_text().count(f" {name}(") for name in ("all-reduce", "all-gather", "all-to-all")}
@@ -94,7 +94,7 @@ def test_two_devices_and_two_processes_have_the_losses_of_one_device(tmp_path):
         # One sum of all gradients a step, outside the loop over chunks; rays stay where they are.
         assert (found["all-reduce"], found["all-gather"], found["all-to-all"]) == (1, 0, 0)
     assert one["all-reduce"] == 0
-    on_one = trained(tmp_path, 1, resumed=[tmp_path / "2-1-0.npz.checkpoint"])
+    on_one = trained(tmp_path, 1, resumed=[tmp_path / "2-1-0.npz.checkpoint.npz"])
     assert_allclose(on_one["losses"], one["losses"][STEPS // 2 :], rtol=1e-4)
 
 

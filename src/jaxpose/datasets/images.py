@@ -221,9 +221,13 @@ def natural_order(name: str) -> list[str | int]:
     return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
 
 
+_SHOWN = 255  # characters of an item of a list
+
+
 def some(items: Sequence[str], most: int = 5) -> str:
     """The first few of a list, for a message of one line."""
-    return ", ".join(items[:most]) + (", ..." if len(items) > most else "")
+    shown = [item if len(item) <= _SHOWN else f"{item[:_SHOWN]}..." for item in items[:most]]
+    return ", ".join(shown) + (", ..." if len(items) > most else "")
 
 
 def found(path: Path) -> str:

@@ -24,7 +24,7 @@ _ARRAY_BYTES = 1 << 36  # of one array
 _HEADER_BYTES = 4096  # of an array: its type and shape in words
 _HEADER = re.compile(
     rb"""\{['"]descr['"]: ['"]([<>|=]?\w{1,20})['"], ['"]fortran_order['"]: (True|False), """
-    rb"""['"]shape['"]: \(((?:\d{1,20}L?,? ?){0,16})\),? ?\}"""
+    rb"""['"]shape['"]: \(((?:\d{1,20}L?, ?){0,16}(?:\d{1,20}L?)?)\),? ?\}"""
 )
 _DEFLATE = 1032  # how far deflate can compress
 _PIXELS = 100_000_000  # of one image

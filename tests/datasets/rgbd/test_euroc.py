@@ -75,7 +75,7 @@ TRUTH = "state_groundtruth_estimate0/data.csv"
         (
             YAML,
             SENSOR.replace("gyroscope_random_walk", "x"),
-            f"{YAML}: gyroscope_random_walk: expected a finite number above 0 up to 1000, got no such entry",
+            f"{YAML}: gyroscope_random_walk: expected a finite number from 0 to 1000, got no such entry",
         ),
         (
             YAML,

@@ -87,6 +87,9 @@ def pair_numbered(
     return Pairs(numbers, [color[n] for n in numbers], [depth[n] for n in numbers], notes)
 
 
+_LONGEST_NAME = 255  # of a file, in any file system
+
+
 class Listing:
     """The files below a folder, found whatever system wrote the names of a list.
 
@@ -99,6 +102,8 @@ class Listing:
 
     def find(self, name: str) -> Path | None:
         """The file that a list names: with `\\` or `./`, in another case, or without its suffix."""
+        if max(map(len, name.split("/"))) > _LONGEST_NAME:
+            return None
         if (file := self.root / name).is_file():
             return file
         found = self.root
