@@ -70,7 +70,7 @@ class Config:
     # [us] from a row to the next, [ms] of each row, both about the middle row's middle, which a photograph's
     # time is. The orbit is photographed so; of other data it is what the camera has.
     line_delay_us: float = 0.0
-    exposure_ms: float = 0.0
+    exposure_ms: float = 0.0  # [ms] for which each row is exposed, about its own time
     # Each ray from the poses of its own row's exposure; "estimate": both numbers are found, from nothing on
     # the orbit, else from those given; "ignore": the orbit is trained as if it had neither.
     shutter: ShutterMode = "known"
