@@ -8,7 +8,7 @@ import time
 import pytest
 from helpers import refused
 
-from jaxpose.experiments import seeds
+from jaxpose.experiments import many_runs, seeds
 from jaxpose.experiments.seeds import Config
 
 # In place of `python -m jaxpose nerf OPTIONS --seed K --out DIR`: writes what it was asked for, or fails.
@@ -65,16 +65,16 @@ def test_an_interrupted_study_leaves_no_run_behind(tmp_path, monkeypatch):
     started = []
 
     def interrupt(futures):
-        while len(seeds._RUNNING) < 2:
+        while len(many_runs._RUNNING) < 2:
             time.sleep(0.01)
-        started.extend(seeds._RUNNING)
+        started.extend(many_runs._RUNNING)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(seeds, "as_completed", interrupt)
+    monkeypatch.setattr(many_runs, "as_completed", interrupt)
     with pytest.raises(KeyboardInterrupt):
         seeds.run(Config(seeds=4, processes=2, out=tmp_path / "study"))
     assert len(started) == 2 and all(process.wait(10) != 0 for process in started)
-    assert not seeds._RUNNING
+    assert not many_runs._RUNNING
 
 
 @pytest.mark.parametrize(
@@ -90,7 +90,7 @@ def test_an_interrupted_study_leaves_no_run_behind(tmp_path, monkeypatch):
 )
 def test_bad_options_are_one_line(args, expected, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(seeds, "_CONNECT_S", 0.2)
+    monkeypatch.setattr(many_runs, "_CONNECT_S", 0.2)
     assert expected in refused.complaint(seeds.main, *args)
     assert not list(tmp_path.iterdir())
 

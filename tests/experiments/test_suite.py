@@ -13,7 +13,7 @@ import pytest
 from helpers import refused
 from PIL import Image
 
-from jaxpose.experiments import suite
+from jaxpose.experiments import many_runs, suite
 from jaxpose.experiments.suite import Config, cases, table
 
 
@@ -45,12 +45,14 @@ def test_an_interrupted_suite_leaves_no_run_behind(tmp_path, monkeypatch):
             super().__init__([sys.executable, "-c", "import time; time.sleep(600)"], **options)
             started.append(self)
 
-    def interrupt(seconds):
+    def interrupt(futures):
+        while len(many_runs._RUNNING) < 2:
+            time.sleep(0.01)
         raise KeyboardInterrupt
 
-    # names of the suite alone: other threads of this process (the test runner's) sleep too
-    monkeypatch.setattr(suite, "subprocess", SimpleNamespace(Popen=Endless, DEVNULL=subprocess.DEVNULL))
-    monkeypatch.setattr(suite, "time", SimpleNamespace(sleep=interrupt, perf_counter=time.perf_counter))
+    names = SimpleNamespace(Popen=Endless, DEVNULL=subprocess.DEVNULL, PIPE=subprocess.PIPE)
+    monkeypatch.setattr(many_runs, "subprocess", names)
+    monkeypatch.setattr(many_runs, "as_completed", interrupt)
     with pytest.raises(KeyboardInterrupt):
         suite.run(Config(sensors=("axial",), processes=2, out=tmp_path / "suite"))
     assert len(started) == 2 and all(process.wait(10) != 0 for process in started)
@@ -84,8 +86,8 @@ def test_a_suite_is_run_and_resumed(tmp_path):
     ended = subprocess.run(command, capture_output=True, text=True, check=True)
     results = json.loads((tmp_path / "suite" / "results.json").read_text())
     failed, room = results["rows"]
-    assert failed["ate_m"] is None and "expected a folder of" in failed["failures"][0]
-    assert re.search(r"failed +nothing, all: .*expected a folder of", ended.stdout)
+    assert failed["ate_m"] is None and "expected a recording" in failed["failures"][0]
+    assert re.search(r"failed +nothing, all: .*expected a recording", ended.stdout)
     run = json.loads((tmp_path / "suite" / "runs" / "room-stipple-5-Hz-0" / "results.json").read_text())
     assert room["ate_m"]["median"] == run["ate_rmse_m"] and room["frames"] == 8
     assert (tmp_path / "suite" / "table.md").read_text().strip() in ended.stdout

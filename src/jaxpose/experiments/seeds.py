@@ -6,23 +6,16 @@ on this machine or, with `--scheduler tcp://HOST:PORT`, on a Dask cluster whose 
 `--resume` goes on where a study of the same folder was stopped, each run from its checkpoint.
 """
 
-import json
 import shlex
-import subprocess
-import sys
 import time
-from collections.abc import Iterator, Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor, as_completed
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
-
-from jaxpose.errors import DataError
 from jaxpose.experiments.checks import check_least, check_positive, check_run_folder
 from jaxpose.experiments.command import MODULE, Command, execute
+from jaxpose.experiments.many_runs import Job, Stated, run_all, spread, spread_text
 from jaxpose.experiments.outcome import SMOKE, Outcome, cost, cost_text, markdown_table
 from jaxpose.experiments.progress import OnUpdate, Update, silent
 from jaxpose.files import atomic, run_folder
@@ -33,8 +26,6 @@ GROUPS = {
 }
 # Options that are set here, or are not of one run.
 _OWN = {"--seed", "--out", "--name", "--resume", "--smoke", "--json", "--study"}
-_CONNECT_S = 10
-_RUNNING: set[subprocess.Popen[str]] = set()  # in this process, to end them with it
 _HEAD = ("options", "registered", "RE [deg]", "TE [%]", "PSNR [dB]", "train [s]")
 _NUMBERS = ("rotation_error_deg", "translation_error_percent", "psnr", "train_s")
 
@@ -103,79 +94,36 @@ def run(config: Config, on_update: OnUpdate = silent) -> Outcome:
         return Outcome(folder, results)
 
 
-def one_run(command: list[str], out: str) -> dict[str, Any] | str:
-    """Run a command in a process of its own, here or on a worker of a cluster.
-
-    Args:
-        command: its words.
-        out: its run folder.
-
-    Returns:
-        What its `results.json` holds; one line where it ended without.
-    """
-    process = subprocess.Popen(
-        command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, encoding="utf-8", errors="replace"
-    )
-    _RUNNING.add(process)
-    lines = process.communicate()[1].strip().splitlines()
-    _RUNNING.discard(process)
-    if process.returncode:
-        return lines[-1] if lines else f"ended with {process.returncode}"
-    return json.loads((Path(out) / "results.json").read_text("utf-8"))
-
-
-@contextmanager
-def _pool(config: Config) -> Iterator[Executor]:
-    """Threads that each wait for a process, or a cluster; what runs here ends with this process."""
-    if config.scheduler is None:
-        with ThreadPoolExecutor(config.processes) as pool:
-            try:
-                yield pool
-            except BaseException:
-                pool.shutdown(wait=False, cancel_futures=True)
-                for process in tuple(_RUNNING):
-                    process.kill()
-                raise
-        return
-    try:
-        from distributed import Client  # pyright: ignore[reportMissingImports]
-    except ImportError:
-        raise DataError('--scheduler: expected Dask, pip install -e ".[cluster]", got none') from None
-    try:
-        client = Client(config.scheduler, timeout=_CONNECT_S)
-    except (OSError, ValueError) as error:
-        line = " ".join(str(error).split())
-        raise DataError(f"--scheduler: expected one at {config.scheduler}, got {line}") from None
-    with client:
-        yield client.get_executor(pure=False)
-
-
-def _run_all(config: Config, folder: Path, on_update: OnUpdate) -> dict[tuple[str, int], Any]:
+def _run_all(config: Config, folder: Path, on_update: OnUpdate) -> dict[tuple[str, int], Stated]:
     """What every run states, by its options and seed."""
-    seeds = range(config.first_seed, config.first_seed + config.seeds)
-    found: dict[tuple[str, int], Any] = {}
-    with _pool(config) as pool:
-        futures = {}
-        for index, command in enumerate(config.commands):
-            for seed in seeds:
-                out = folder / "runs" / f"{index}-{seed}"
-                words = [sys.executable, "-m", "jaxpose", config.experiment, *shlex.split(command)]
-                words += ["--seed", str(seed), "--out", str(out), *(["--smoke"] if config.smoke else [])]
-                words += ["--resume"] if config.resume and out.exists() else []
-                futures[pool.submit(one_run, words, str(out))] = command, seed
-        for future in as_completed(futures):
-            command, seed = futures[future]
-            found[command, seed] = future.result()
-            last = {"last": f"{command} seed {seed}".strip()}
-            on_update(Update("training", len(found), len(futures), "runs", last))
-    return found
+    jobs = {
+        (command, seed): Job(
+            [config.experiment, *shlex.split(command), "--seed", str(seed)],
+            folder / "runs" / f"{index}-{seed}",
+        )
+        for index, command in enumerate(config.commands)
+        for seed in range(config.first_seed, config.first_seed + config.seeds)
+    }
+
+    def told(key: tuple[str, int], done: int) -> None:
+        last = {"last": f"{key[0]} seed {key[1]}".strip()}
+        on_update(Update("training", done, len(jobs), "runs", last))
+
+    return run_all(
+        jobs,
+        processes=config.processes,
+        smoke=config.smoke,
+        resume=config.resume,
+        scheduler=config.scheduler,
+        on_done=told,
+    )
 
 
 def _stated(config: Config, command: str, found: dict[tuple[str, int], Any]) -> dict[str, Any]:
     """A row of the results: medians and ranges over the seeds; None where no run states a number."""
     runs = {seed: run for (of, seed), run in sorted(found.items()) if of == command}
     good = {seed: run for seed, run in runs.items() if isinstance(run, dict)}
-    numbers = {name: [run[name] for run in good.values() if run.get(name) is not None] for name in _NUMBERS}
+    numbers = {name: spread([run.get(name) for run in good.values()]) for name in _NUMBERS}
     registered = [
         seed for seed, run in good.items() if run["rotation_error_deg"] is not None
         and run["rotation_error_deg"] <= config.registered_deg
@@ -184,15 +132,9 @@ def _stated(config: Config, command: str, found: dict[tuple[str, int], Any]) -> 
         "options": command,
         "seeds": list(runs),
         "registered": registered,
-        **{name: _spread(values) for name, values in numbers.items()},
+        **numbers,
         "failures": {seed: run for seed, run in runs.items() if isinstance(run, str)},
     }
-
-
-def _spread(values: list[float]) -> dict[str, float] | None:
-    if not values:
-        return None
-    return {"median": float(np.median(values)), "min": min(values), "max": max(values)}
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
@@ -210,16 +152,9 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
         cells.append((
             row["options"] or "(defaults)",
             f"{len(row['registered'])} of {len(row['seeds'])}{failed}",
-            *(_cell(row[name], digits) for name, digits in zip(_NUMBERS, (3, 3, 2, 0), strict=True)),
+            *(spread_text(row[name], digits) for name, digits in zip(_NUMBERS, (3, 3, 2, 0), strict=True)),
         ))  # fmt: skip
     return markdown_table(cells)
-
-
-def _cell(spread: dict[str, float] | None, digits: int) -> str:
-    if spread is None:
-        return "n/a"
-    median, least, most = (f"{spread[name]:.{digits}f}" for name in ("median", "min", "max"))
-    return median if least == most else f"{median} ({least} to {most})"
 
 
 def report(outcome: Outcome) -> str:

@@ -5,24 +5,19 @@ table and one picture of medians with their ranges, failures included. Runs are 
 their own; `--resume` goes on where a suite of the same folder was stopped.
 """
 
-import json
 import os
 import re
-import subprocess
-import sys
-import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, NamedTuple, get_args
-
-import numpy as np
+from typing import Any, NamedTuple, get_args
 
 from jaxpose.datasets.synthetic.depth_sensors import Sensor
 from jaxpose.errors import DataError
 from jaxpose.experiments.checks import check_least, check_positive, check_run_folder
 from jaxpose.experiments.command import MODULE, Command, execute
+from jaxpose.experiments.many_runs import Job, run_all, spread, spread_text
 from jaxpose.experiments.outcome import SMOKE, Outcome, cost, cost_text, markdown_table
 from jaxpose.experiments.progress import OnUpdate, Update, silent
 from jaxpose.files import atomic, run_folder
@@ -32,7 +27,6 @@ GROUPS = {
     "what": ("data", "rates_hz", "sensors", "seeds", "smoke"),
     "run": ("out", "name", "resume", "processes", "json"),
 }
-_POLL_S = 0.2
 _HEAD = ("recording", "rate", "ATE [cm]", "RPE [cm]", "lost", "uncertain", "wrong told", "s/frame", "MB")
 
 
@@ -126,54 +120,27 @@ def run(config: Config, on_update: OnUpdate = silent) -> Outcome:
 
 
 def _run_all(config: Config, todo: list[Case], folder: Path, on_update: OnUpdate) -> list[Row]:
-    """Every case with every seed, as many at once as the config says; none goes on without this one."""
-    waiting = [(case, seed) for case in todo for seed in range(config.seeds)]
-    total, running = len(waiting), {}
-    found: dict[tuple[Case, int], dict[str, Any] | str] = {}
-    try:
-        while waiting or running:
-            while waiting and len(running) < config.processes:
-                run = waiting.pop(0)
-                running[run] = _start(config, *run, folder / "runs")
-            for run in [run for run, started in running.items() if started.process.poll() is not None]:
-                found[run] = _ended(running.pop(run))
-                last = {"last": f"{run[0].recording}, {run[0].rate}, seed {run[1]}"}
-                on_update(Update("tracking", len(found), total, "runs", last))
-            time.sleep(_POLL_S)
-    finally:
-        for started in running.values():
-            started.process.kill()
+    """Every case with every seed."""
+    jobs = {
+        (case, seed): Job(
+            ["slam", "--imu", "none", *case.args, "--seed", str(seed)],
+            folder / "runs" / re.sub(r"[^\w.]+", "-", f"{case.recording}-{case.rate}-{seed}"),
+        )
+        for case in todo
+        for seed in range(config.seeds)
+    }
+
+    def told(key: tuple[Case, int], done: int) -> None:
+        last = {"last": f"{key[0].recording}, {key[0].rate}, seed {key[1]}"}
+        on_update(Update("tracking", done, len(jobs), "runs", last))
+
+    found = run_all(jobs, processes=config.processes, smoke=config.smoke, resume=config.resume, on_done=told)
     rows = []
     for case in todo:
         of_case = [found[case, seed] for seed in range(config.seeds)]
         good = tuple(x for x in of_case if isinstance(x, dict))
         rows.append(Row(case, good, tuple(x for x in of_case if isinstance(x, str))))
     return rows
-
-
-class _Started(NamedTuple):
-    process: subprocess.Popen[bytes]
-    out: Path
-    said: IO[bytes]  # what it says on stderr
-
-
-def _start(config: Config, case: Case, seed: int, runs: Path) -> _Started:
-    out = runs / re.sub(r"[^\w.]+", "-", f"{case.recording}-{case.rate}-{seed}")
-    command = [sys.executable, "-m", "jaxpose", "slam", "--imu", "none", *case.args, "--seed", str(seed)]
-    command += ["--out", str(out), *(["--smoke"] if config.smoke else [])]
-    command += ["--resume"] if config.resume and out.exists() else []
-    said = tempfile.TemporaryFile()
-    return _Started(subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=said), out, said)
-
-
-def _ended(started: _Started) -> dict[str, Any] | str:
-    """The results of a run; one line where it ended without."""
-    with started.said as said:
-        said.seek(0)
-        lines = said.read().decode("utf-8", "replace").strip().splitlines()
-    if started.process.returncode:
-        return lines[-1] if lines else f"ended with {started.process.returncode}"
-    return json.loads((started.out / "results.json").read_text("utf-8"))
 
 
 def _stated(row: Row) -> dict[str, Any]:
@@ -189,15 +156,9 @@ def _stated(row: Row) -> dict[str, Any]:
         "peak_rss_bytes": [r["peak_rss_bytes"] for r in row.results],
     }
     frames = row.results[0]["frames"] if row.results else None
-    spread = {name: _spread([x for x in values if x is not None]) for name, values in numbers.items()}
+    spreads = {name: spread(values) for name, values in numbers.items()}
     case = {"recording": row.case.recording, "rate": row.case.rate, "frames": frames}
-    return {**case, **spread, "failures": list(row.failures)}
-
-
-def _spread(values: list[float]) -> dict[str, float] | None:
-    if not values:
-        return None
-    return {"median": float(np.median(values)), "min": min(values), "max": max(values)}
+    return {**case, **spreads, "failures": list(row.failures)}
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
@@ -216,22 +177,15 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
         cells.append((
             row["recording"],
             row["rate"],
-            _cell(row["ate_m"], 100, 2) + failed,
-            _cell(row["rpe_m"], 100, 2),
-            _cell(row["frames_lost"], 1, 0) + ("" if row["frames"] is None else f" of {row['frames']}"),
-            _cell(row["frames_uncertain"], 1, 0),
+            spread_text(row["ate_m"], 2, 100) + failed,
+            spread_text(row["rpe_m"], 2, 100),
+            spread_text(row["frames_lost"], 0) + ("" if row["frames"] is None else f" of {row['frames']}"),
+            spread_text(row["frames_uncertain"], 0),
             "n/a" if wrong is None else f"{told['median']:.0f} of {wrong['median']:.0f}",
-            _cell(row["seconds_per_frame"], 1, 2),
-            _cell(row["peak_rss_bytes"], 1 / 2**20, 0),
+            spread_text(row["seconds_per_frame"], 2),
+            spread_text(row["peak_rss_bytes"], 0, 1 / 2**20),
         ))  # fmt: skip
     return markdown_table(cells)
-
-
-def _cell(spread: dict[str, float] | None, scale: float | int, digits: int) -> str:
-    if spread is None:
-        return "n/a"
-    median, least, most = (f"{scale * spread[name]:.{digits}f}" for name in ("median", "min", "max"))
-    return median if least == most else f"{median} ({least} to {most})"
 
 
 def report(outcome: Outcome) -> str:
