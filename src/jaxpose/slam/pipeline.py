@@ -36,7 +36,7 @@ from jaxpose.slam.map.backend import (
 )
 from jaxpose.slam.map.texture import Texture, make_texture, textured
 from jaxpose.slam.observation import to_device
-from jaxpose.slam.tracker import next_pose, unrolled
+from jaxpose.slam.tracker import expected_motion, next_pose, unrolled
 from jaxpose.slam.tracking.features import detect
 from jaxpose.slam.tracking.intrinsic_frame import is_due, make_refit, window
 from jaxpose.slam.tracking.predict import GYRO_BIAS_SIGMA
@@ -265,10 +265,15 @@ def _advance(state: SlamState, frame: Frame, t: float, imu: Imu | None, read: Fr
     generator = np.random.default_rng([config.seed, i])
     track_key, map_key = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), i))
     state = state._replace(frames=state.frames.appended(t), imu=_joined(state, imu))
-    frame = unrolled(state, frame)
+    predicted = expected_motion(state) if i else None
+    if predicted is not None:
+        frame = unrolled(state, predicted, frame)
     image = to_device(frame)._replace(exposure=state.exposure)
     features = detect(frame, state.camera) if config.uses_features else None
-    state = next_pose(state, frame, image, features, generator, track_key) if i else _first_pose(state)
+    if predicted is None:
+        state = _first_pose(state)
+    else:
+        state = next_pose(state, predicted, frame, image, features, generator, track_key)
     state = state._replace(features=features)
     if config.frame == "intrinsic" and is_due(i):
         state = _update_intrinsic_frame(state)

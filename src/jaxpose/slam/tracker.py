@@ -36,15 +36,19 @@ from jaxpose.slam.types import Frames, Motion, SlamState, TrackingStatus
 
 def next_pose(
     state: SlamState,
+    by_motion: MotionPrediction,
     frame: Frame,
     image: Image,
     features: Features | None,
     generator: np.random.Generator,
     key: PRNGKeyArray,
 ) -> SlamState:
-    """The state with the pose of its last frame, which has none yet: registered, or predicted and marked."""
+    """The state with the pose of its last frame, which has none yet: registered, or predicted and marked.
+
+    `by_motion` is what was expected of it (`expected_motion`).
+    """
     config, policy, frames = state.config, state.config.recovery, state.frames
-    predicted = by_motion = _predict(state)
+    predicted = by_motion
     seen = None if features is None else seen_pose(state, predicted, frame, features)
     if seen is not None:
         state, predicted = with_features(state, predicted, seen)
@@ -84,16 +88,19 @@ def next_pose(
     return _update_state(state, frames, predicted, by_motion, tracked, status)
 
 
-def unrolled(state: SlamState, frame: Frame) -> Frame:
+def unrolled(state: SlamState, predicted: MotionPrediction, frame: Frame) -> Frame:
     """The state's last frame, all of it at its first row's time, by the speed that is expected there."""
-    if state.config.line_delay_us == 0 or state.frames.count < 2:
+    if state.config.line_delay_us == 0:
         return frame
-    twist_cam = rigid.adjoint(rigid.inverse(state.T_body_cam)) @ _predict(state).twist
+    twist_cam = rigid.adjoint(rigid.inverse(state.T_body_cam)) @ predicted.twist
     return at_first_row(frame, state.camera, twist_cam, state.config.line_delay_us / 1e6)
 
 
-def _predict(state: SlamState) -> MotionPrediction:
-    """The motion by constant velocity or by the readings, and how far off [m, rad] it may be."""
+def expected_motion(state: SlamState) -> MotionPrediction:
+    """The motion to the last frame, before it is looked at, and how far off [m, rad] it may be.
+
+    By constant velocity or by the readings.
+    """
     config, frames, motion = state.config, state.frames, state.motion
     start, end = frames.t[-2:].tolist()
     T_world_ref, dt = frames.T_world_body[-2], end - start
