@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 from jaxpose.errors import DataError
 from jaxpose.files.colmap import ColmapCamera
 from jaxpose.geometry.camera import Camera
+from jaxpose.geometry.camera import resized as resized_camera
 
 Kind = Literal["opencv", "radial4", "fisheye", "fov", "thin_prism_fisheye"]
 
@@ -110,15 +111,7 @@ def as_camera(seen: Lens) -> Camera | None:
 
 def resized(seen: Lens, width: int, height: int) -> Lens:
     """The lens of the image resized, the image's outer edge being kept."""
-    sx, sy = width / seen.width, height / seen.height
-    return seen._replace(
-        fx=seen.fx * sx,
-        fy=seen.fy * sy,
-        cx=(seen.cx + 0.5) * sx - 0.5,
-        cy=(seen.cy + 0.5) * sy - 0.5,
-        width=width,
-        height=height,
-    )
+    return Lens(seen.kind, *resized_camera(Camera(*seen[1:7]), width, height)[:6], seen.coefficients)
 
 
 def project(

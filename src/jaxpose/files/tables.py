@@ -278,21 +278,6 @@ def read_all_numbers(path: Path, counts: tuple[int, ...], wanted: str) -> Float[
     return numbers
 
 
-def read_unchecked(path: Path) -> Float[np.ndarray, "n c"]:
-    """The numbers of those lines that have as many as the first, whatever is on others; empty if none."""
-    rows = []
-    for _, line in numbered_lines(path):
-        numbers = []
-        for word in line.replace(",", " ").split():
-            try:
-                numbers.append(float(word))
-            except ValueError:
-                break
-        if not rows or len(numbers) == len(rows[0]):
-            rows.append(numbers)
-    return np.array(rows).reshape(len(rows), -1)
-
-
 def seconds(ns: list[int], t0_ns: int) -> Float[np.ndarray, " n"]:
     """Nanoseconds as float64 seconds since `t0_ns`.
 

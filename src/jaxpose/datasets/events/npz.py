@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxpose.datasets.events.sidecar import Source, load_source, with_camera
+from jaxpose.datasets.events.sidecar import Source, load_beside, with_camera
 from jaxpose.datasets.events.stream import BLOCK, Block, Stream, Unit
 from jaxpose.datasets.images import only, some
 from jaxpose.datasets.types import EventRecording
@@ -58,9 +58,7 @@ def load(
         DataError: Naming the file, and line or event, for anything that cannot be used (`validate.clean`).
         ValueError: For another mosaic, and for a span that does not rise.
     """
-    source = find(path, size=size)
-    ground_truth = source.stream.file.parent / "poses.txt"
-    return load_source(source, ground_truth, mosaic=mosaic, unit=unit, span=span)[0]
+    return load_beside(find(path, size=size), mosaic=mosaic, unit=unit, span=span)
 
 
 def find(path: Path | str, *, size: tuple[int, int] | None = None) -> Source:

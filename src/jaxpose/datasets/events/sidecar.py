@@ -57,6 +57,14 @@ def load_source(
     return recording, zero_s
 
 
+def load_beside(
+    source: Source, *, mosaic: Mosaic, unit: Unit | None, span: tuple[float, float] | None
+) -> EventRecording:
+    """What `load_source` makes of events with `poses.txt` in the folder of their file."""
+    truth = source.stream.file.parent / "poses.txt"
+    return load_source(source, truth, mosaic=mosaic, unit=unit, span=span)[0]
+
+
 def check_mosaic(mosaic: str) -> None:
     """ValueError for a colour mosaic that is not known."""
     if mosaic not in get_args(Mosaic):

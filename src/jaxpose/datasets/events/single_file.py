@@ -7,7 +7,7 @@ from jaxpose.datasets.events.aedat4 import aedat4_stream
 from jaxpose.datasets.events.event_stream import MAGIC as EVENT_STREAM
 from jaxpose.datasets.events.event_stream import es_stream
 from jaxpose.datasets.events.prophesee import dat_stream, raw_stream
-from jaxpose.datasets.events.sidecar import Source, load_source, with_camera
+from jaxpose.datasets.events.sidecar import Source, load_beside, with_camera
 from jaxpose.datasets.events.stream import Stream, Unit
 from jaxpose.datasets.events.text import holds_events, text_stream
 from jaxpose.datasets.images import only
@@ -60,9 +60,7 @@ def load(
         DataError: Naming the file, and line or event, for anything that cannot be used (`validate.clean`).
         ValueError: For another mosaic, and for a span that does not rise.
     """
-    source = find(path, size=size)
-    ground_truth = source.stream.file.parent / "poses.txt"
-    return load_source(source, ground_truth, mosaic=mosaic, unit=unit, span=span)[0]
+    return load_beside(find(path, size=size), mosaic=mosaic, unit=unit, span=span)
 
 
 def find(path: Path | str, *, size: tuple[int, int] | None = None) -> Source:
@@ -83,8 +81,8 @@ def find(path: Path | str, *, size: tuple[int, int] | None = None) -> Source:
 
 
 def _files(folder: Path) -> list[Path]:
-    found = (file for file in sorted(folder.glob("*")) if file.suffix.lower() in SUFFIXES)
-    return [file for file in found if file.is_file() and not file.name.startswith(".") and _is_events(file)]
+    found = (file for file in sorted(folder.glob("*")) if file.is_file() and not file.name.startswith("."))
+    return [file for file in found if is_events(file)]
 
 
 def is_events(file: Path) -> bool:
@@ -96,10 +94,8 @@ def is_events(file: Path) -> bool:
     Returns:
         Whether `load` should read it.
     """
-    return file.suffix.lower() in SUFFIXES and _is_events(file)
-
-
-def _is_events(file: Path) -> bool:
+    if file.suffix.lower() not in SUFFIXES:
+        return False
     if file.suffix.lower() == ".csv":
         return holds_events(file)
     with file.open("rb") as stream:

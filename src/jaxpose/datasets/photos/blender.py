@@ -2,7 +2,7 @@
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -183,7 +183,7 @@ def _read(file: Path) -> _Source:
         names=[frame["file_path"] for frame in frames],
         images=images,
         lenses=lenses,
-        masks=[_mask(file, frame, image) for frame, image in zip(frames, images, strict=True)],
+        masks=[_mask(file, find, frame, image) for frame, image in zip(frames, images, strict=True)],
         T_world_cam=_poses(file, frames),
         t=t[order],
         stamped=stamped,
@@ -198,10 +198,10 @@ def _lenses(file: Path, entries: Sequence[dict[str, Any]], images: Sequence[Path
     return [frame_lens(file, entry, size) for entry in entries]
 
 
-def _mask(file: Path, frame: dict[str, Any], image: Path) -> Mask | None:
+def _mask(file: Path, find: Callable[[str], Path | None], frame: dict[str, Any], image: Path) -> Mask | None:
     """nerfstudio's mask, bright where pixels count, or instant-ngp's, bright where they do not."""
     if frame.get("mask_path") is not None:
-        found = finder(file.parent)(str(frame["mask_path"]))
+        found = find(str(frame["mask_path"]))
         if found is None:
             raise DataError(f"{file}: expected the mask of {frame['file_path']}, got no {frame['mask_path']}")
         return Mask(found)

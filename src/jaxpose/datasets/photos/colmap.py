@@ -148,7 +148,7 @@ def _images(folder: Path, names: Sequence[str], width: int | None) -> tuple[Path
     for candidate in (*candidates, *places):
         if not candidate.is_dir() or (candidate in places and best):
             continue
-        files = [finder_of(name) for finder_of in (finder(candidate),) for name in names]
+        files = list(map(finder(candidate), names))
         if count := sum(file is not None for file in files):
             first = next(file for file in files if file is not None)
             best.append((count, stored_size(first)[0][0], candidate, files))

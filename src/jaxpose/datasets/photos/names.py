@@ -5,15 +5,13 @@ import re
 from collections.abc import Callable
 from pathlib import Path, PurePosixPath
 
-from jaxpose.datasets.images import SUFFIXES
+from jaxpose.datasets.images import SUFFIXES, may_exist, natural_order
 
 IMAGE_SUFFIXES = (*SUFFIXES, ".webp", ".bmp", ".tif", ".tiff")
 
 
 def images_in(folder: Path) -> list[Path]:
     """The image files of a folder and of those in it, in natural order of their names; no `._*` of macOS."""
-    from jaxpose.datasets.images import natural_order
-
     found = [path for path in _files(folder) if path.suffix.lower() in IMAGE_SUFFIXES]
     return sorted(found, key=lambda path: natural_order(path.relative_to(folder).as_posix()))
 
@@ -45,6 +43,8 @@ def finder(folder: Path) -> Callable[[str], Path | None]:
 
     def find(name: str) -> Path | None:
         plain = name.replace("\\", "/")
+        if not may_exist(plain):
+            return None
         # What is there under the very name goes first, so that a suffix is tried in the order of SUFFIXES.
         for candidate in (name, plain, *(f"{plain}{suffix}" for suffix in SUFFIXES)):
             if (folder / candidate).is_file():

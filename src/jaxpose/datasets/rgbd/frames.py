@@ -14,6 +14,7 @@ from jaxpose.datasets.images import (
     common_size,
     depth_unit,
     image_size,
+    may_exist,
     name_of,
     read_color,
     read_depth,
@@ -87,9 +88,6 @@ def pair_numbered(
     return Pairs(numbers, [color[n] for n in numbers], [depth[n] for n in numbers], notes)
 
 
-_LONGEST_NAME = 255  # of a file, in any file system
-
-
 class Listing:
     """The files below a folder, found whatever system wrote the names of a list.
 
@@ -102,7 +100,7 @@ class Listing:
 
     def find(self, name: str) -> Path | None:
         """The file that a list names: with `\\` or `./`, in another case, or without its suffix."""
-        if max(map(len, name.split("/"))) > _LONGEST_NAME:
+        if not may_exist(name):
             return None
         if (file := self.root / name).is_file():
             return file
