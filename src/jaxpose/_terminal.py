@@ -2,7 +2,11 @@
 
 import os
 import re
+import signal
 import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import NoReturn
 
 _CONTROLS = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
@@ -45,3 +49,30 @@ def fail(name: str, message: str) -> NoReturn:
     """Exit with code 1 and one line on stderr."""
     words = " ".join(message.split())
     sys.exit(printable(f"{name}: {words if len(words) < 2000 else words[:2000] + ' ...'}"))
+
+
+@contextmanager
+def ended_by_interrupt(name: str) -> Iterator[None]:
+    """Let Ctrl-C end the process at once, with one line on stderr and code 1, while nothing is to be kept.
+
+    For imports: what an interrupt raises among them may be swallowed, as by JAX's callback of the garbage
+    collector, and the process would go on.
+
+    Args:
+        name: what that line begins with.
+    """
+
+    def end(*_: object) -> NoReturn:
+        cleared = "\r\x1b[2K" if sys.stderr.isatty() else ""
+        os.write(2, f"{cleared}{printable(name)}: interrupted\n".encode())
+        os._exit(1)
+
+    ours = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # not ignored, nor a caller's
+    if not ours or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    signal.signal(signal.SIGINT, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)

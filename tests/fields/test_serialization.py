@@ -169,15 +169,24 @@ def test_a_configuration_comes_back_equal(tmp_path):
 def test_other_files_are_refused(tmp_path):
     np.savez(tmp_path / "old.npz", control_points=np.zeros((5, 7)), span=np.zeros(2))
     np.savez(tmp_path / "new.npz", version=2)
-    for name, found in (("old.npz", "got none"), ("new.npz", "got 2")):
-        message = f"{name}: expected a trajectory of version 1, {found}"
-        with pytest.raises(ValueError, match=message):
+    np.savez(tmp_path / "table.npz", version=np.ones((11, 3)))
+    for name, found in (("old.npz", "none"), ("new.npz", "2"), ("table.npz", "an array of shape .11, 3.$")):
+        message = f"{name}: expected a trajectory of version 1, got {found}"
+        with pytest.raises(ValueError, match=message if name != "table.npz" else "of version 1, got"):
             numpy_evaluator.load(tmp_path / name)
         with pytest.raises(DataError, match=message):
             serialization.load(tmp_path / name)
     (tmp_path / "text.npz").write_text("no archive")
     with pytest.raises(DataError, match="text.npz: expected a trajectory, got"):
         serialization.load(tmp_path / "text.npz")
+
+
+def test_a_count_in_another_type_of_number_is_read(tmp_path):
+    entries = entries_of("stamped") | {"count": np.asarray(1.0, ">f8")}
+    np.savez(tmp_path / "field.npz", **entries)
+    field, params = serialization.load(tmp_path / "field.npz")
+    evaluated = numpy_evaluator.load(tmp_path / "field.npz")(np.array([0.5]))
+    np.testing.assert_allclose(evaluated, poses_of(field, params, [0.5]), atol=1e-6)
 
 
 def entries_of(kind: str) -> dict[str, np.ndarray]:

@@ -49,6 +49,9 @@ def anywhere(random: Random, content: bytes) -> bytes:
     return bytes(data)
 
 
+LONGEST = 4_000_000  # bytes of a damaged text
+
+
 def text(random: Random, content: bytes) -> bytes:
     """Numbers replaced by others, lines left out, repeated, exchanged, of other separators and lengths."""
     words = content.decode("utf-8", "surrogateescape")
@@ -76,6 +79,8 @@ def text(random: Random, content: bytes) -> bytes:
                     ((" ", ","), (",", " "), ("\n", "\r"), (".", ","), (":", " "), ("\n", ""))
                 )
                 lines[row] = lines[row].replace(old, new)
+        if sum(map(len, lines)) > LONGEST:
+            break
         words = "".join(lines)
     return words.encode("utf-8", "surrogateescape")
 
@@ -159,7 +164,7 @@ def npy(random: Random, content: bytes) -> bytes:
         try:
             np.save(stream, array(random, np.load(io.BytesIO(content))), allow_pickle=False)
             return stream.getvalue()
-        except ValueError:
+        except (ValueError, MemoryError):  # its header lies already
             pass
     return _header(random, content)
 

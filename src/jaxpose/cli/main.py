@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import jaxpose
-from jaxpose._terminal import fail, prepare, say
+from jaxpose._terminal import ended_by_interrupt, fail, prepare, say
 
 
 class _Subcommand(NamedTuple):
@@ -54,12 +54,9 @@ def main(args: Sequence[str] | None = None) -> None:
     elif name == "--version":
         say("jaxpose", f"jaxpose {jaxpose.__version__}")
     elif name in SUBCOMMANDS:
-        try:
+        with ended_by_interrupt(f"jaxpose {name}"):
             from jaxpose.experiments.command import start  # here, as --help and --version do without
-
-            start(SUBCOMMANDS[name].module, args[1:], prog=f"jaxpose {name}")
-        except KeyboardInterrupt:
-            fail(f"jaxpose {name}", "interrupted")
+        start(SUBCOMMANDS[name].module, args[1:], prog=f"jaxpose {name}")
     else:
         near = difflib.get_close_matches(name, SUBCOMMANDS, 1)
         hint = f"; did you mean {near[0]}?" if near else ""

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import platformdirs
 import tyro
 
-from jaxpose._terminal import fail, prepare, say
+from jaxpose._terminal import ended_by_interrupt, fail, prepare, say
 from jaxpose.errors import DataError
 from jaxpose.experiments import progress
 from jaxpose.experiments.option_help import Groups, help_text
@@ -53,13 +53,14 @@ def start(module: str, args: Sequence[str] | None = None, **given: Any) -> None:
         given: what else `main` takes.
     """
     prepare()
+    name = given.get("prog", "jaxpose")
+    with ended_by_interrupt(name), progress.shown() as on_update:
+        on_update(Update("loading jaxpose", quiet=True))
+        main = importlib.import_module(module).main
     try:
-        with progress.shown() as on_update:
-            on_update(Update("loading jaxpose", quiet=True))
-            main = importlib.import_module(module).main
         main(args, **given)
     except KeyboardInterrupt:
-        fail(given.get("prog", "jaxpose"), "interrupted")
+        fail(name, "interrupted")
 
 
 def execute(command: Command, args: Sequence[str] | None = None) -> Any:

@@ -49,7 +49,7 @@ RANGES = {
         ("gyro_density", "accelerometer_density", "gyro_walk", "accelerometer_walk"), Range(0, 1e3)
     ),
     "map_every_s": _POSITIVE,
-    "line_delay_us": Range(-1e4, 1e4),  # below 0: read from the last row to the first
+    "line_delay_us": Range(-1e6, 1e6),  # below 0: read from the last row to the first
     "wait_s": _POSITIVE,
     "voxel": Range(0, 100, True),
     "seed": Range(0, 2**32 - 1),

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxpose.errors import DataError
-from jaxpose.files.schema import FARTHEST_M, choice, increasing, numbers, rigid_transforms
+from jaxpose.files.schema import FARTHEST_M, check_version, choice, increasing, numbers, rigid_transforms
 from jaxpose.files.untrusted import read_npz
 
 VERSION = 1
@@ -26,9 +26,7 @@ def read_entries(path: Path | str) -> dict[str, np.ndarray]:
         DataError: naming file and entry, for another file, and for what gives no finite poses.
     """
     data = read_npz(path, "a trajectory")
-    if not np.array_equal(data.get("version", "none"), VERSION):
-        found = data.get("version", "none")
-        raise DataError(f"{path}: expected a trajectory of version {VERSION}, got {found!s:.40}")
+    check_version(path, data, VERSION, "a trajectory")
     _check_span(path, data, "span", above=False)
     for number in range(int(numbers(path, data, "count", whole=True, least=1, most=len(data)))):
         name = f"{number}."

@@ -18,12 +18,12 @@ def load(path):
     """
     if not isinstance(path, dict):
         with np.load(path, allow_pickle=False) as file:
-            if file.get("version") != 1:
-                found = file.get("version", "none")
+            if not np.array_equal(file.get("version", "none"), 1):
+                found = " ".join(str(file.get("version", "none")).split())[:40]
                 raise ValueError(f"{path}: expected a trajectory of version 1, got {found}")
             return load(dict(file))
     data = {k: v.astype(float) if v.dtype.kind == "f" else v for k, v in path.items()}
-    names = [f"{number}." for number in range(data["count"])]
+    names = [f"{number}." for number in range(int(data["count"]))]
     factors = [{k.removeprefix(name): v for k, v in data.items() if k.startswith(name)} for name in names]
 
     def pose(t):

@@ -92,6 +92,24 @@ def choice(path: Path | str, content: Any, key: str, among: Sequence[str] | None
     return value
 
 
+def check_version(path: Path | str, content: Mapping[str, Any], version: int, what: str) -> None:
+    """Refuse a file that another version wrote.
+
+    Args:
+        path: the file.
+        content: what was read, with its `version`; none: what has no version.
+        version: that which is read.
+        what: the file is, "a map".
+
+    Raises:
+        DataError: `path: expected ... of version ..., got ...`.
+    """
+    found = np.asarray(content.get("version", "none"))
+    if not np.array_equal(found, version):
+        got = str(found) if found.ndim == 0 else f"an array of shape {found.shape}"
+        raise DataError(f"{path}: expected {what} of version {version}, got {got:.40}")
+
+
 def increasing(path: Path | str, key: str, t: Float[np.ndarray, " n"]) -> None:
     """Refuse times that do not increase.
 

@@ -10,7 +10,7 @@ from jaxtyping import Int
 
 from jaxpose.errors import DataError
 from jaxpose.files import atomic
-from jaxpose.files.schema import numbers
+from jaxpose.files.schema import check_version, numbers
 from jaxpose.files.untrusted import read_npz
 from jaxpose.scenes.voxel_blocks import CHANNELS, NODES, BlockConfig, Blocks, packed, unpacked
 from jaxpose.slam.map.texture import SIDE, Texture
@@ -53,9 +53,7 @@ def write_map(path: Path | str, saved: SavedMap) -> None:
 def read_map(path: Path | str) -> SavedMap:
     """Read what `write_map` wrote; DataError naming file and entry for what is not that."""
     content = read_npz(path, "a map")
-    version = content.get("version", "none")
-    if not np.array_equal(version, _VERSION):
-        raise DataError(f"{path}: expected a map of version {_VERSION}, got {version!s:.40}")
+    check_version(path, content, _VERSION, "a map")
     number = partial(numbers, path, content)
     voxel, truncation = (float(number(key, above=0, most=_LARGEST_M)) for key in ("voxel", "truncation"))
     config = BlockConfig(voxel, truncation)
