@@ -233,3 +233,27 @@ def test_names_stay_in_their_folder(name):
     with pytest.raises(DataError, match="f: expected a file name that stays in its folder, got"):
         schema.name_inside("f", name)
     assert schema.name_inside("f", "images/a..b.png") == "images/a..b.png"
+
+
+@pytest.mark.parametrize(
+    "array",
+    [
+        np.arange(12.0).reshape(3, 4),
+        np.asfortranarray(np.arange(12, dtype=">i4").reshape(3, 4)),
+        np.array(4.5, np.float32),
+        np.array([True, False]),
+        np.array(["a", "bc"]),
+        np.zeros((0, 3)),
+        np.arange(200_000),  # longer than what is read at a time
+    ],
+    ids=lambda array: f"{array.dtype} {array.shape}",
+)
+def test_arrays_are_what_numpy_reads(tmp_path, array):
+    np.savez_compressed(tmp_path / "a.npz", a=array)
+    np.save(tmp_path / "a.npy", array)
+    for found in (
+        untrusted.read_npz(tmp_path / "a.npz", "arrays")["a"],
+        untrusted.read_npy(tmp_path / "a.npy", "an array"),
+    ):
+        assert (found.dtype, found.shape, found.flags.writeable) == (array.dtype, array.shape, True)
+        np.testing.assert_array_equal(found, array)

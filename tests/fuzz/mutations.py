@@ -202,6 +202,57 @@ def npz(random: Random, content: bytes) -> bytes:
     return stream.getvalue() if random.random() < 0.9 else anywhere(random, stream.getvalue())
 
 
+def hdf5(random: Random, content: bytes) -> bytes:
+    """Data sets replaced, left out, renamed."""
+    import h5py
+
+    stream = io.BytesIO(content)
+    try:
+        with h5py.File(stream, "r+") as file:
+            names: list[str] = []
+            file.visit(names.append)
+            name = random.choice([name for name in names if isinstance(file[name], h5py.Dataset)])
+            value = file[name][()]
+            del file[name]
+            match random.randrange(5):
+                case 0:
+                    pass
+                case 1:
+                    file[random.choice(("x", "events/ts", "data"))] = value
+                case 2:
+                    file.create_dataset(name, random.choice(((10**12,), (3, 4), ())), "f8", chunks=None)
+                case _:
+                    new = array(random, value)
+                    file[name] = new if new.dtype.kind not in "UM" else [b"x"]
+    except Exception:  # damaged already
+        return anywhere(random, content)
+    return stream.getvalue()
+
+
+def zipped(random: Random, content: bytes) -> bytes:
+    """Members of an archive damaged, left out, renamed."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            members = {name: archive.read(name) for name in archive.namelist()}
+    except Exception:  # damaged already
+        return anywhere(random, content)
+    name = random.choice(list(members)) if random.random() < 0.5 else min(members)
+    match random.randrange(6):
+        case 0:
+            del members[name]
+        case 1:
+            members[random.choice(("x", "../x", "rgbd/9.jpg"))] = members.pop(name)
+        case 2:
+            members[name] = members[random.choice(list(members))]
+        case _:
+            members[name] = (tree if members[name].startswith(b"{") else anywhere)(random, members[name])
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w") as archive:
+        for name, value in members.items():
+            archive.writestr(name, value)
+    return stream.getvalue() if random.random() < 0.9 else anywhere(random, stream.getvalue())
+
+
 def _header(random: Random, content: bytes) -> bytes:
     """An array's header with another shape or type."""
     shape = random.choice(
@@ -236,8 +287,9 @@ BY_SUFFIX: dict[str, tuple[Callable[[Random, bytes], bytes], ...]] = {
     ".json": (tree, tree, tree, text, anywhere),
     ".png": (png, anywhere),
     ".jpg": (anywhere,),
-    ".h5": (anywhere,),
-    ".bin": (anywhere,),
+    ".h5": (hdf5, hdf5, anywhere),
+    ".r3d": (zipped, zipped, anywhere),
+    **dict.fromkeys((".bin", ".bag", ".db3", ".mcap", ".raw", ".dat", ".es", ".aedat4", ".mp4"), (anywhere,)),
     ".ply": (text, anywhere),
 }
 

@@ -23,6 +23,7 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
+sys.path.insert(1, str(Path(__file__).parents[1]))  # what tests share
 SLOWEST_S, MOST_BYTES, DEAD_S = 10.0, 1 << 30, 30.0
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from captures import CAPTURES
 from PIL import Image
 
 from jaxpose.cli.check import command as check
@@ -383,6 +384,7 @@ _ANY_FILE = _of("a.txt", lambda file: trajectories.read_trajectory(file).traject
 _kitti_file = partial(_table, lambda file, trajectory: trajectories.write_kitti(file, trajectory.T))
 
 TARGETS = {
+    **{name: Target(*functions) for name, functions in CAPTURES.items()},
     **{name: Target(write, _recording) for name, write in _RECORDINGS.items()},
     **{name: Target(write, _events) for name, write in _EVENTS.items()},
     **{

@@ -43,7 +43,7 @@ def named_columns(table: Table, wanted: Mapping[str, str]) -> Named | None:
     for header in table.headers:
         text = re.sub(r"^(fields|columns|format)\s*:?\s+", "", header, flags=re.IGNORECASE)
         named = match_names(_split(text, table.separator), wanted)
-        if named is not None and len(_split(text, table.separator)) == len(table.words[0]):
+        if named is not None and len(_split(text, table.separator)) == len(table.words(0)):
             return named
     return None
 
@@ -115,18 +115,20 @@ def joined_clock(table: Table) -> Table:
     for k, header in enumerate(table.headers):
         names = [_plain(name)[0] for name in _split(header, table.separator)]
         first = next((i for i in range(len(names) - 1) if _is_clock(names[i], names[i + 1])), None)
-        if first is None or len(names) != len(table.words[0]):
+        if first is None or len(names) != len(table.words(0)):
             continue
-        words = [
-            [*row[:first], f"{row[first]}.{row[first + 1].zfill(9)}", *row[first + 2 :]]
-            if len(row) == len(names)
-            else row
-            for row in table.words
-        ]
         mark = table.separator or " "
+        rows = [mark.join(_join(table.words(row), first, len(names))) for row in range(len(table.rows))]
         joined = mark.join([*names[:first], "t[s]", *names[first + 2 :]])
-        return table._replace(words=words, headers=(joined, *table.headers[k + 1 :]))
+        return table._replace(rows=rows, headers=(joined, *table.headers[k + 1 :]))
     return table
+
+
+def _join(words: list[str], first: int, count: int) -> list[str]:
+    """A row of `count` words with its seconds and nanoseconds in one; others as they are."""
+    if len(words) != count:
+        return words
+    return [*words[:first], f"{words[first]}.{words[first + 1].zfill(9)}", *words[first + 2 :]]
 
 
 def _is_clock(first: str, second: str) -> bool:

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from jaxpose.errors import DataError
 from jaxpose.files.columns import POSE, column_names, match_names, named_columns
 from jaxpose.files.tables import Table
-from jaxpose.files.timestamps import Unit, to_decimal, units
+from jaxpose.files.timestamps import Unit, to_decimal, to_stamps, units
 
 Format = Literal["TUM", "CSV", "KITTI", "EuRoC", "4x4 list"]
 KNOWN = (
@@ -61,7 +61,7 @@ def pose_layout(path: Path, table: Table, columns: str | None) -> Layout:
     Raises:
         DataError: For what is no such table, or may be read in two ways.
     """
-    width = len(table.words[0])
+    width = len(table.words(0))
     if columns is not None:
         names = column_names(columns)
         named = match_names(names, POSE)
@@ -87,7 +87,7 @@ def pose_layout(path: Path, table: Table, columns: str | None) -> Layout:
         return TUM
     if table.separator is not None and width in (8, 11, 17):
         return _unnamed_csv(path, table, width)
-    line = (table.separator or " ").join(table.words[0])
+    line = (table.separator or " ").join(table.words(0))
     raise DataError(f"{path}:{table.lines[0]}: expected a trajectory, {KNOWN}, got {line[:60]!r}")
 
 
@@ -95,8 +95,8 @@ def _unnamed_csv(path: Path, table: Table, width: int) -> Layout:
     """Csv without a header: EuRoC's where timestamps are in ns, xyzw where they are in seconds."""
     if width > 8:
         return EUROC._replace(refused_unit="s")
-    numbers = [number for row in table.words if (number := to_decimal(row[0])) is not None]
-    found = units(numbers, "s") if numbers else ["ns"]
+    numbers = [number for word in table.column(0) if (number := to_decimal(word)) is not None]
+    found = units(to_stamps([str(number) for number in numbers]), "s") if numbers else ["ns"]
     if len(numbers) == 1 and not Decimal(1e9) < numbers[0] < Decimal(4e9) and numbers[0] == int(numbers[0]):
         found = ["ns"] if numbers[0] > Decimal(10) ** 17 else ["s", "ns"]
     if found == ["s"]:
@@ -119,14 +119,15 @@ def first_behind_comment(table: Table) -> tuple[Table, tuple[str, ...]]:
     Returns:
         The table, with the first pose if it was behind #, and notes.
     """
-    notes, hidden, width = [], 0, len(table.words[0])
+    notes, hidden, width = [], 0, len(table.words(0))
     for number, text in table.comments:
         glued = re.fullmatch(r"TUM trajectory, format:.*<qw>([^<>]*)", text)
         words = (glued[1] if glued else text).split(table.separator)
         if len(words) != width or width == 1 or None in [to_decimal(word.strip()) for word in words]:
             continue
         if glued and number < table.lines[0]:
-            table = table._replace(lines=[number, *table.lines], words=[words, *table.words])
+            row = (table.separator or " ").join(words)
+            table = table._replace(lines=[number, *table.lines], rows=[row, *table.rows])
             notes.append(f"the first pose stands behind # in line {number}, as Open3D writes it: read")
         else:
             hidden += 1

@@ -54,7 +54,7 @@ def read_matrices(path: Path) -> Float[np.ndarray, "n 4 4"]:
         DataError: Naming file and line for what is no such list.
     """
     table = read_table(path)
-    columns = len(table.words[0])
+    columns = len(table.words(0))
     wanted = f"{columns} numbers of 4x4 poses"
     lines, values = read_numbers(path, wanted, counts=(columns,), separator=table.separator, finite=False)
     if values.size % 16:

@@ -7,8 +7,9 @@ is refused.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from decimal import Decimal
+from operator import lt
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,7 +18,7 @@ from jaxtyping import Float
 
 from jaxpose.errors import DataError
 from jaxpose.files.schema import FARTHEST_M
-from jaxpose.files.timestamps import PER_SECOND, POSES, Steps, Unit, format_ns, to_decimal, to_ns, units
+from jaxpose.files.timestamps import POSES, Stamps, Steps, Unit, format_ns, to_decimal, to_stamps, units
 
 _NO_NUMBER = {"", "nan", "-nan", "null", "none", "na", "n/a"}  # how writers say that there is none
 
@@ -31,22 +32,33 @@ class StampedRows(NamedTuple):
     unit: Unit = "s"  # in which the file has its timestamps
     repeated: tuple[int, ...] = ()  # lines left out as their timestamp is that of the row before
     missing: tuple[int, ...] = ()  # lines left out for NaN, infinity or nothing in place of a number
-    written_s: tuple[Decimal, ...] = ()  # the timestamps [s] with all of their digits
+    stamps: Stamps = Stamps([], 0)  # the timestamps with all of their digits, in `unit`
 
 
 class Table(NamedTuple):
-    """A text table as words."""
+    """A text table."""
 
     lines: list[int]  # number of each row's line, from 1
-    words: list[list[str]]
+    rows: list[str]  # as they are, less blanks around them and a separator at their end
     separator: str | None  # comma, semicolon, or None: blanks
-    headers: tuple[str, ...]  # lines above the first row, without # or %, the nearest first
+    headers: tuple[str, ...] = ()  # lines above the first row, without # or %, the nearest first
     comments: tuple[tuple[int, str], ...] = ()  # all lines behind # or %, with their numbers
+
+    def words(self, row: int) -> list[str]:
+        """The words of a row, without blanks around them."""
+        return [word.strip() for word in self.rows[row].split(self.separator)]
+
+    def column(self, k: int) -> list[str]:
+        """Word `k` of every row; IndexError where one has fewer."""
+        return [row.split(self.separator, k + 1)[k].strip() for row in self.rows]
 
 
 def numbered_lines(path: Path) -> list[tuple[int, str]]:
-    """The lines of a text file with something on them, and their numbers from 1; OSError as usual."""
-    return [(k, line) for k, line in _all_lines(path) if not line.lstrip().startswith("#")]
+    """The lines of a text file with something on them, and their numbers from 1; OSError as usual.
+
+    They come without blanks around them, and without those that begin with #.
+    """
+    return [(k, line) for k, line in _all_lines(path) if line[0] != "#"]
 
 
 def read_table(path: Path) -> Table:
@@ -56,30 +68,33 @@ def read_table(path: Path) -> Table:
         path: The file.
 
     Returns:
-        Its rows, words split at commas or semicolons where the first row has any, else at blanks; a
-        separator at the end of a line begins no column.
+        Its rows, separated by commas or semicolons where the first has any, else by blanks; a separator at
+        the end of a line begins no column.
     """
     headers: list[str] = []
     comments: list[tuple[int, str]] = []
-    lines, words = [], []
+    lines, rows = [], []
     separator = None
     for number, line in _all_lines(path):
-        text = line.strip()
-        comment = text[0] in "#%"
-        bare = text.lstrip("#%").strip()
-        if comment:
-            comments.append((number, bare))
-        named = not lines and not _is_row(text)
-        if not lines and (comment or named):
-            headers.insert(0, bare)
-        if comment or named:
-            continue
+        if line[0] in "#%":
+            comments.append((number, line.lstrip("#%").strip()))
         if not lines:
-            separator = next((mark for mark in ",;" if mark in text), None)
-        row = [word.strip() for word in text.split(separator)]
+            if line[0] in "#%" or not _is_row(line):
+                headers.insert(0, line.lstrip("#%").strip())
+                continue
+            separator = _separator(line)
+        if line[0] in "#%":
+            continue
         lines.append(number)
-        words.append(row[:-1] if separator and not row[-1] else row)
-    return Table(lines, words, separator, tuple(headers), tuple(comments))
+        rows.append(line[:-1].rstrip() if line[-1] == separator else line)
+    return Table(lines, rows, separator, tuple(headers), tuple(comments))
+
+
+def find_separator(path: Path) -> str | None:
+    """The separator of a table's first row, as `read_table` finds it."""
+    with path.open(encoding="utf-8-sig", errors="replace") as lines:
+        rows = (line for line in map(str.strip, lines) if line and line[0] not in "#%" and _is_row(line))
+        return _separator(next(rows, ""))
 
 
 def stamped_rows(
@@ -111,38 +126,64 @@ def stamped_rows(
             file where more than one unit makes sense of the timestamps, where none does, and where no row is
             left.
     """
-    rows, missing = _numbers(path, table, columns, at)
-    if not rows:
+    lines, stamps, values, missing = _columns(table, at) or _numbers(path, table, columns, at)
+    if not lines:
         got = f"NaN or infinity in all {len(missing)}" if missing else "none"
         raise DataError(f"{path}: expected lines of {columns}, got {got}")
     if not exact:
-        unit = _unit_of(path, [row[1] for row in rows], unit, steps)
-    found, repeated = StampedRows([], [], np.zeros((0, 0)), unit), []
-    kept, written = [], []
-    for number, timestamp, values in rows:
-        ns = to_ns(timestamp, unit)
-        if found.ns and ns == found.ns[-1]:
-            repeated.append(number)
-            continue
-        _check_after(path, number, found.ns, ns)
-        found.lines.append(number)
-        found.ns.append(ns)
-        kept.append(values)
-        written.append(timestamp / PER_SECOND[unit])
-    return found._replace(
-        values=np.array(kept).reshape(len(found.ns), -1),
-        repeated=tuple(repeated),
-        missing=missing,
-        written_s=tuple(written),
-    )
+        unit = _unit_of(path, stamps, unit, steps)
+    ns, repeated = stamps.ns(unit), []
+    if not all(map(lt, ns, ns[1:])):
+        kept = [0]
+        for row in range(1, len(ns)):
+            if ns[row] == ns[kept[-1]]:
+                repeated.append(lines[row])
+                continue
+            _check_after(path, lines[row], ns[kept[-1]], ns[row])
+            kept.append(row)
+        lines, ns, values, stamps = (
+            [lines[k] for k in kept],
+            [ns[k] for k in kept],
+            values[kept],
+            stamps.rows(kept),
+        )
+    return StampedRows(lines, ns, values, unit, tuple(repeated), missing, stamps)
 
 
-def _numbers(
-    path: Path, table: Table, columns: str, at: Sequence[int]
-) -> tuple[list[tuple[int, Decimal, list[float]]], tuple[int, ...]]:
-    """Line, timestamp and numbers of the rows that have them, and the lines of those that do not."""
-    rows, missing, width = [], [], len(table.words[0]) if table.words else 0
-    for number, words in zip(table.lines, table.words, strict=True):
+_Columns = tuple[list[int], Stamps, np.ndarray, tuple[int, ...]]  # lines, what they hold, and lines left out
+
+
+def _columns(table: Table, at: Sequence[int]) -> _Columns | None:
+    """Timestamps and numbers of a table of nothing else; None where a row needs a look of its own."""
+    try:
+        stamps = to_stamps(table.column(at[0]))
+        values = np.zeros((len(table.rows), 0))
+        if len(at) > 1:
+            values = _numeric(table.rows, table.separator)[:, at[1:]]
+    except (ValueError, IndexError):
+        return None
+    finite = np.isfinite(values).all(1)
+    if (np.abs(values[finite]) > FARTHEST_M).any():
+        return None
+    if finite.all():
+        return table.lines, stamps, values, ()
+    lines, kept = np.array(table.lines), np.flatnonzero(finite)
+    return lines[kept].tolist(), stamps.rows(kept), values[kept], tuple(lines[~finite].tolist())
+
+
+def _numeric(rows: Sequence[str], separator: str | None) -> Float[np.ndarray, "n c"]:
+    """Rows of as many numbers each; ValueError for others, and for what only Python takes for a number."""
+    if not all(rows):
+        raise ValueError("rows with nothing in them")
+    return np.loadtxt(rows or ["none"], np.float64, comments=None, delimiter=separator, ndmin=2)
+
+
+def _numbers(path: Path, table: Table, columns: str, at: Sequence[int]) -> _Columns:
+    """As `_columns`, row by row: what is no number is named, and rows without numbers are left out."""
+    lines, stamps, rows, missing = [], [], [], []
+    width = len(table.words(0)) if table.rows else 0
+    for row, number in enumerate(table.lines):
+        words = table.words(row)
         if len(words) != width:
             raise DataError(f"{path}:{number}: expected {columns}, got {len(words)}")
         values, timestamp = [_number(words[k]) for k in at[1:]], to_decimal(words[at[0]])
@@ -154,9 +195,11 @@ def _numbers(
             raise DataError(f"{path}:{number}: expected {columns}, none above {FARTHEST_M:g}, got {got:g}")
         if timestamp is None or len(kept) < len(values):
             missing.append(number)
-        else:
-            rows.append((number, timestamp, kept))
-    return rows, tuple(missing)
+            continue
+        lines.append(number)
+        stamps.append(words[at[0]])
+        rows.append(kept)
+    return lines, to_stamps(stamps), np.array(rows).reshape(len(rows), len(at) - 1), tuple(missing)
 
 
 def left_out_notes(path: Path, rows: StampedRows) -> tuple[str, ...]:
@@ -184,9 +227,24 @@ def read_numbers(
     Raises:
         DataError: Naming file and line, for another number of columns, for text, and for an empty table.
     """
-    lines, rows = [], []
-    for number, line in numbered_lines(path):
-        fields = line.split(separator)
+    numbered = numbered_lines(path)
+    table = Table([number for number, _ in numbered], [line for _, line in numbered], separator)
+    try:
+        found = _numeric(table.rows, separator)
+        if found.shape[1] in counts and (np.isfinite(found).all() or not finite):
+            return table.lines, found[:, : min(counts)]
+    except ValueError:
+        pass
+    return _read_lines(path, table, columns, counts, finite)
+
+
+def _read_lines(
+    path: Path, table: Table, columns: str, counts: tuple[int, ...], finite: bool
+) -> tuple[list[int], Float[np.ndarray, "n c"]]:
+    """`read_numbers` line by line: names what is none, and takes lines of different counts."""
+    rows = []
+    for number, line in zip(table.lines, table.rows, strict=True):
+        fields = line.split(table.separator)
         if len(fields) not in counts:
             raise DataError(f"{path}:{number}: expected {columns}, got {len(fields)}")
         try:
@@ -195,11 +253,10 @@ def read_numbers(
             raise DataError(f"{path}:{number}: expected {columns}, got {line[:60]!r}") from None
         if finite and not all(map(math.isfinite, row)):
             raise DataError(f"{path}:{number}: expected finite numbers, got {line[:60]!r}")
-        lines.append(number)
         rows.append(row)
     if not rows:
         raise DataError(f"{path}: expected lines of {columns}, got none")
-    return lines, np.array(rows)
+    return table.lines, np.array(rows)
 
 
 def read_stamped(
@@ -222,13 +279,12 @@ def read_stamped(
         DataError: As `read_numbers`, for timestamps that go backwards, and for such as make sense in no unit
             or in more than one.
     """
-    table = Table([], [], separator, ())
-    for number, line in numbered_lines(path)[:rows]:
-        words = [word.strip() for word in line.split(separator)]
-        if len(words) != count:
-            raise DataError(f"{path}:{number}: expected {columns}, got {len(words)}")
-        table.lines.append(number)
-        table.words.append(words)
+    numbered = numbered_lines(path)[:rows]
+    table = Table([number for number, _ in numbered], [line for _, line in numbered], separator)
+    for row, (number, line) in enumerate(numbered):
+        found = line.count(separator) + 1 if separator else len(line.split())
+        if found != count:
+            raise DataError(f"{path}:{number}: expected {columns}, got {len(table.words(row))}")
     return stamped_rows(path, table, columns, range(count), unit=unit)
 
 
@@ -249,21 +305,27 @@ def read_stamped_names(
         DataError: Naming file and line for anything else, and for timestamps that do not increase.
     """
     wanted = f"a timestamp in {'seconds' if unit == 's' else 'ns'} and a file name"
-    rows: list[tuple[int, Decimal, str]] = []
+    lines, words, names = [], [], []
     for number, line in numbered_lines(path):
-        first, *rest = line.split(separator, maxsplit=1)
-        timestamp, name = to_decimal(first.strip()), rest[0].strip() if rest else ""
-        if timestamp is None or not name:
+        word, *rest = line.split(separator, maxsplit=1)
+        if not rest or not rest[0].strip():
             raise DataError(f"{path}:{number}: expected {wanted}, got {line[:60]!r}")
-        rows.append((number, timestamp, name))
-    if not rows:
+        lines.append(number)
+        words.append(word.strip())
+        names.append(rest[0].strip())
+    if not lines:
         raise DataError(f"{path}: expected lines of a timestamp and a file name, got none")
-    unit = _unit_of(path, [timestamp for _, timestamp, _ in rows], unit)
-    stamps: list[int] = []
-    for number, timestamp, _ in rows:
-        _check_after(path, number, stamps, to_ns(timestamp, unit))
-        stamps.append(to_ns(timestamp, unit))
-    return stamps, [name for *_, name in rows]
+    try:
+        stamps = to_stamps(words)
+    except ValueError:
+        bad = next(line for line, word in zip(lines, words, strict=True) if to_decimal(word) is None)
+        line = dict(numbered_lines(path))[bad]
+        raise DataError(f"{path}:{bad}: expected {wanted}, got {line[:60]!r}") from None
+    ns = stamps.ns(_unit_of(path, stamps, unit))
+    if not all(map(lt, ns, ns[1:])):
+        for row in range(1, len(ns)):
+            _check_after(path, lines[row], ns[row - 1], ns[row])
+    return ns, names
 
 
 def read_all_numbers(path: Path, counts: tuple[int, ...], wanted: str) -> Float[np.ndarray, " n"]:
@@ -292,9 +354,14 @@ def format_rows(rows: Float[np.ndarray, "n c"]) -> str:
     return "".join(" ".join(map(repr, row)) + "\n" for row in np.asarray(rows, np.float64).tolist())
 
 
-def _all_lines(path: Path) -> list[tuple[int, str]]:
+def _all_lines(path: Path) -> Iterator[tuple[int, str]]:
+    """Lines with something on them, without blanks around them, and their numbers from 1."""
     text = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
-    return [(k, line) for k, line in enumerate(text, 1) if line.strip()]
+    return ((k, stripped) for k, line in enumerate(text, 1) if (stripped := line.strip()))
+
+
+def _separator(row: str) -> str | None:
+    return next((mark for mark in ",;" if mark in row), None)
 
 
 def _is_row(line: str) -> bool:
@@ -311,12 +378,13 @@ def _number(word: str) -> float | None:
         return math.nan if word.lower() in _NO_NUMBER else None
 
 
-def _unit_of(path: Path, numbers: list[Decimal], expected: Unit, steps: Steps = POSES) -> Unit:
+def _unit_of(path: Path, stamps: Stamps, expected: Unit, steps: Steps = POSES) -> Unit:
     """The one unit that makes sense of timestamps; DataError where there are more, or none."""
-    found = units(numbers, expected, steps)
+    found = units(stamps, expected, steps)
     if len(found) == 1:
         return found[0]
-    span = f"{numbers[0]} to {numbers[-1]} in {len(numbers)} lines"
+    first, last = (Decimal(stamps.whole[k]).scaleb(-stamps.digits) for k in (0, -1))
+    span = f"{first} to {last} in {len(stamps.whole)} lines"
     if not found:
         raise DataError(f"{path}: expected timestamps that make sense in s, ms, us or ns, got {span}")
     raise DataError(
@@ -324,7 +392,7 @@ def _unit_of(path: Path, numbers: list[Decimal], expected: Unit, steps: Steps = 
     )
 
 
-def _check_after(path: Path, number: int, stamps: list[int], timestamp: int) -> None:
-    if stamps and timestamp <= stamps[-1]:
-        last, got = (f"{format_ns(x)} s" for x in (stamps[-1], timestamp))
+def _check_after(path: Path, number: int, before: int, timestamp: int) -> None:
+    if timestamp <= before:
+        last, got = (f"{format_ns(x)} s" for x in (before, timestamp))
         raise DataError(f"{path}:{number}: expected a timestamp after {last}, got {got}")

@@ -5,15 +5,16 @@ they become floats.
 """
 
 from collections.abc import Sequence
-from decimal import Decimal, InvalidOperation
+from decimal import Context, Decimal, InvalidOperation
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 Unit = Literal["s", "ms", "us", "ns"]
 PER_SECOND: dict[Unit, int] = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}
-_LARGEST = Decimal(10) ** 19  # ns since 1970 until the year 2286
+_LARGEST = 10**19  # ns since 1970 until the year 2286
+_MOST_DIGITS = 400  # decimals of a number; float64 has none behind them
 _SINCE_1970_S = (1e8, 4e9)  # from 1973 to 2096
 _WHOLE_PERIOD_S = 2.0  # numbers that are all whole and so far apart are no seconds
 FLOAT_S = 1e6  # below it float64 seconds hold whole ns
@@ -33,6 +34,81 @@ _DIGITS_NS = 1e3  # steps of ns below it have no decimals
 _LEAST_S = 1e-5  # steps below it make no sense
 
 
+class Stamps(NamedTuple):
+    """Timestamps to their last digit."""
+
+    whole: list[int]  # in units of 10^-digits
+    digits: int
+
+    def ns(self, unit: Unit) -> list[int]:
+        """In whole ns, if `unit` is what they are written in."""
+        per, scale = 10**9 // PER_SECOND[unit], 10**self.digits
+        if per % scale:
+            return [_rounded(number * per, scale) for number in self.whole]
+        return self.whole if per == scale else [number * (per // scale) for number in self.whole]
+
+    def since(self, t0_ns: int, unit: Unit) -> Float[np.ndarray, " n"]:
+        """In seconds since `t0_ns`, rounded once, if `unit` is what they are written in."""
+        per = 10**self.digits * PER_SECOND[unit]
+        scale = max(per, 10**9)
+        factor, zero = scale // per, t0_ns * (scale // 10**9)
+        return np.array([(number * factor - zero) / scale for number in self.whole], np.float64)
+
+    def rows(self, kept: Sequence[int] | Int[np.ndarray, " m"]) -> "Stamps":
+        """Those at some places."""
+        return self._replace(whole=[self.whole[k] for k in kept])
+
+
+def to_stamps(words: Sequence[str]) -> Stamps:
+    """Timestamps as a file has them, without blanks around them.
+
+    Args:
+        words: Numbers, which `to_decimal` takes.
+
+    Returns:
+        The numbers.
+
+    Raises:
+        ValueError: For others.
+
+    >>> to_stamps(["1403715523.91214", "1403715524"])
+    Stamps(whole=[140371552391214, 140371552400000], digits=5)
+    """
+    try:
+        return _plain_stamps(words)
+    except ValueError:  # exponents, or what is none at all
+        return _decimal_stamps(words)
+
+
+def _plain_stamps(words: Sequence[str]) -> Stamps:
+    """Numbers of digits and a point."""
+    text, most = "".join(words), 0
+    if "." in text:
+        digits = [len(word) - at - 1 if (at := word.find(".")) >= 0 else 0 for word in words]
+        most = max(digits)
+        whole = [int(word.replace(".", "", 1)) for word in words]
+        if min(digits) < most:
+            whole = [number * 10 ** (most - count) for number, count in zip(whole, digits, strict=True)]
+    else:
+        whole = list(map(int, words))
+    largest = _LARGEST * 10**most
+    if "_" in text or most > _MOST_DIGITS or any(not -largest < number < largest for number in whole):
+        raise ValueError("digits that are not that plain")
+    return Stamps(whole, most)
+
+
+def _decimal_stamps(words: Sequence[str]) -> Stamps:
+    """Numbers in any notation."""
+    numbers = [to_decimal(word) for word in words]
+    known = [number for number in numbers if number is not None]
+    if len(known) < len(numbers):
+        raise ValueError("a timestamp that is none")
+    exponents = [int(number.as_tuple().exponent) for number in known]
+    digits = min(max(0, -min(exponents, default=0)), _MOST_DIGITS)
+    context = Context(prec=_MOST_DIGITS + 30)
+    return Stamps([round(context.scaleb(number, digits)) for number in known], digits)
+
+
 def to_decimal(word: str) -> Decimal | None:
     """A number as it is written, to its last digit; None for what is none, NaN and what no clock shows."""
     try:
@@ -42,16 +118,11 @@ def to_decimal(word: str) -> Decimal | None:
     return number if number.is_finite() and -_LARGEST < number < _LARGEST else None
 
 
-def to_ns(number: Decimal, unit: Unit) -> int:
-    """A timestamp in whole ns."""
-    return round(number * (10**9 // PER_SECOND[unit]))
-
-
-def units(numbers: Sequence[Decimal], expected: Unit, steps: Steps = POSES) -> list[Unit]:
+def units(stamps: Stamps, expected: Unit, steps: Steps = POSES) -> list[Unit]:
     """The units that timestamps may be written in, by their size, their steps and their decimals.
 
     Args:
-        numbers: Timestamps as a file has them.
+        stamps: Timestamps as a file has them, one at least.
         expected: The unit of its format, which is believed wherever it makes sense: a date from 1973 to 2096,
             or steps of up to five times the longest (of 2 s where all numbers are whole, which seconds of
             so few frames are not).
@@ -60,16 +131,17 @@ def units(numbers: Sequence[Decimal], expected: Unit, steps: Steps = POSES) -> l
     Returns:
         One unit where there is no doubt, else every one that makes sense; none at all if none does.
 
-    >>> units([Decimal(1403636580863555584), Decimal(1403636580913555584)], "s")
+    >>> units(to_stamps(["1403636580863555584", "1403636580913555584"]), "s")
     ['ns']
-    >>> units([Decimal(0), Decimal(60), Decimal(120)], "s")
+    >>> units(to_stamps(["0", "60", "120"]), "s")
     ['s', 'ms']
     """
-    latest = float(max(abs(number) for number in numbers))
+    scale = 10**stamps.digits
+    latest = max(map(abs, stamps.whole)) / scale
     size = {unit: latest / PER_SECOND[unit] for unit in get_args(Unit)}
     dated = [unit for unit, s in size.items() if _SINCE_1970_S[0] <= s <= _SINCE_1970_S[1]]
-    whole = all(number == number.to_integral_value() for number in numbers)
-    step = _median_step(numbers)
+    whole = stamps.digits == 0 or not any(number % scale for number in stamps.whole)
+    step = _median_step(stamps)
     if not whole and (step is None or step < _DIGITS_NS):
         size.pop("ns")
     if expected in dated and expected in size:
@@ -125,6 +197,13 @@ def whole_ns(t: Float[np.ndarray, " n"], t0_ns: int) -> list[int]:
     return [t0_ns + round(s * 1e9) for s in t.tolist()]
 
 
-def _median_step(numbers: Sequence[Decimal]) -> float | None:
-    steps = [float(b - a) for a, b in zip(numbers, numbers[1:], strict=False) if b > a]
+def _median_step(stamps: Stamps) -> float | None:
+    scale = 10**stamps.digits
+    steps = [(b - a) / scale for a, b in zip(stamps.whole, stamps.whole[1:], strict=False) if b > a]
     return float(np.median(steps)) if steps else None
+
+
+def _rounded(number: int, scale: int) -> int:
+    """number / scale, to the nearest, to the even of two."""
+    whole, rest = divmod(number, scale)
+    return whole + (2 * rest > scale or (2 * rest == scale and whole % 2))

@@ -1,6 +1,5 @@
 """Files of trajectories: TUM, KITTI, EuRoC (and TUM-VI), tables with a header, lists of 4x4 matrices."""
 
-from decimal import Decimal
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -25,6 +24,7 @@ from jaxpose.files.layouts import (
 from jaxpose.files.matrices import read_matrices, where_finite
 from jaxpose.files.tables import (
     StampedRows,
+    find_separator,
     format_rows,
     left_out_notes,
     read_numbers,
@@ -116,7 +116,7 @@ def read_trajectory(path: Path | str, columns: str | None = None) -> TrajectoryF
     )
     if rows.unit == layout.refused_unit:
         raise DataError(
-            f"{path}: expected timestamps in {layout.unit}, as csv of {len(table.words[0])} columns "
+            f"{path}: expected timestamps in {layout.unit}, as csv of {len(table.words(0))} columns "
             f"without a header is EuRoC's or VINS', got {rows.unit}: say what they hold, --columns"
         )
     trajectory, quaternion_xyzw, rows = _poses(path, rows, layout)
@@ -233,8 +233,8 @@ def read_kitti(path: Path | str, *, rate_hz: float = 10.0) -> Trajectory:
     if not 0 < rate_hz < np.inf:
         raise ValueError(f"rate_hz: expected a positive number, got {rate_hz}")
     path = Path(path)
-    table = read_table(path)
-    lines, values = read_numbers(path, _KITTI_COLUMNS, counts=(12,), separator=table.separator, finite=False)
+    separator = find_separator(path)
+    lines, values = read_numbers(path, _KITTI_COLUMNS, counts=(12,), separator=separator, finite=False)
     rows = values.reshape(-1, 3, 4)
     T = where_finite(rigid.make(rows[..., :3], rows[..., 3]), lambda i: f"{path}:{lines[i]}")
     return Trajectory(np.arange(len(T)) / rate_hz, T)
@@ -299,8 +299,7 @@ def read_timestamps(path: Path | str) -> list[int]:
     """
     path = Path(path)
     table, wanted = read_table(path), "a line that begins with a timestamp"
-    first = table._replace(words=[words[:1] for words in table.words])
-    rows = stamped_rows(path, first, wanted, (0,), unit="s")
+    rows = stamped_rows(path, table._replace(rows=table.column(0)), wanted, (0,), unit="s")
     if rows.repeated or rows.missing:
         line = min(rows.repeated or rows.missing)
         got = "a repeated one" if rows.repeated else "NaN"
@@ -312,8 +311,8 @@ def _whole(path: Path, layout: Layout, counts: tuple[int, ...], separator: str |
     """A trajectory in a stated format, without gaps."""
     assert layout.columns is not None
     table = read_table(path)
-    if table.lines and (len(table.words[0]) not in counts or table.separator != separator):
-        got = len(table.words[0]) if table.separator == separator else repr(" ".join(table.words[0])[:60])
+    if table.lines and (len(table.words(0)) not in counts or table.separator != separator):
+        got = len(table.words(0)) if table.separator == separator else repr(" ".join(table.words(0))[:60])
         raise DataError(f"{path}:{table.lines[0]}: expected {layout.words}, got {got}")
     rows = stamped_rows(path, table, layout.words, layout.columns, unit=layout.unit, exact=True)
     trajectory, _, rows = _poses(path, rows, layout)
@@ -332,17 +331,18 @@ def _poses(
     there = norm > 0.5
     if not there.any():
         raise DataError(f"{path}:{rows.lines[0]}: expected a unit quaternion, got zero")
-    kept = np.flatnonzero(there)
-    zero = tuple(rows.lines[i] for i in np.flatnonzero(~there))
-    rows = rows._replace(
-        lines=[rows.lines[i] for i in kept],
-        ns=[rows.ns[i] for i in kept],
-        values=rows.values[kept],
-        missing=tuple(sorted((*rows.missing, *zero))),
-        written_s=tuple(rows.written_s[i] for i in kept),
-    )
+    if not there.all():
+        kept = np.flatnonzero(there)
+        zero = tuple(rows.lines[i] for i in np.flatnonzero(~there))
+        rows = rows._replace(
+            lines=[rows.lines[i] for i in kept],
+            ns=[rows.ns[i] for i in kept],
+            values=rows.values[kept],
+            missing=tuple(sorted((*rows.missing, *zero))),
+            stamps=rows.stamps.rows(kept),
+        )
     t0_ns, xyzw = origin(rows.ns), rows.values[:, 3:]
-    t = np.array([float(s - Decimal(t0_ns) / 10**9) for s in rows.written_s])
+    t = rows.stamps.since(t0_ns, rows.unit)
     T = rigid.make(Rotation.from_quat(xyzw).as_matrix(), rows.values[:, :3])
     return Trajectory(t, T, t0_ns), xyzw, rows
 

@@ -6,6 +6,7 @@ where there is one. `schema` checks what was read.
 
 import json
 import math
+import os
 import re
 import reprlib
 import zipfile
@@ -21,6 +22,7 @@ from jaxpose.errors import DataError
 _TEXT_BYTES = 256 << 20  # JSON; its objects take some twenty times as much
 _YAML_BYTES = 100_000  # data sheets of sensors are a few kB, and its parser is slow
 _ARRAY_BYTES = 1 << 36  # of one array
+_PIECE_BYTES = 1 << 18  # read at a time: what a processor's cache holds
 _HEADER_BYTES = 4096  # of an array: its type and shape in words
 _HEADER = re.compile(
     rb"""\{['"]descr['"]: ['"]([<>|=]?\w{1,20})['"], ['"]fortran_order['"]: (True|False), """
@@ -153,12 +155,15 @@ def _array(stream: _Stream, size: int) -> np.ndarray:
     rest, wanted = size - (stream.tell() - start), math.prod(shape) * kind.itemsize
     if wanted != rest or wanted > _ARRAY_BYTES:
         raise ValueError(f"{kind} of shape {shape} in {rest} bytes")
-    content = stream.read(wanted)
-    if len(content) != wanted or stream.read(1):  # the end of a member has its checksum
-        raise EOFError(f"{len(content)} bytes for {kind} of shape {shape}")
+    content, filled = np.empty(wanted, np.uint8), 0
+    while filled < wanted and (piece := stream.read(min(_PIECE_BYTES, wanted - filled))):
+        content[filled : filled + len(piece)] = np.frombuffer(piece, np.uint8)
+        filled += len(piece)
+    if filled < wanted or stream.read(1):  # the end of a member has its checksum
+        raise EOFError(f"{filled} bytes for {kind} of shape {shape}")
     if not wanted:
         return np.zeros(shape, kind)
-    return np.frombuffer(content, kind).reshape(shape, order="F" if fortran else "C").copy("K")
+    return content.view(kind).reshape(shape, order="F" if fortran else "C")
 
 
 @contextmanager
@@ -321,13 +326,12 @@ def opened_image(path: Path | str) -> Iterator[Any]:
     """
     from PIL import Image
 
-    path = Path(path)
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise DataError(f"{path}: expected an image, got nothing")
     with reading(path, "an image"), Image.open(path, formats=_FORMATS) as image:
-        pixels = image.width * image.height
-        if not 0 < pixels <= min(_PIXELS, _PIXELS_PER_BYTE * path.stat().st_size):
-            raise ValueError(f"{image.width}x{image.height} pixels in {path.stat().st_size} bytes")
+        size = os.path.getsize(path)
+        if not 0 < image.width * image.height <= min(_PIXELS, _PIXELS_PER_BYTE * size):
+            raise ValueError(f"{image.width}x{image.height} pixels in {size} bytes")
         yield image
 
 

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from PIL import ExifTags, Image, ImageOps
+from PIL.PngImagePlugin import PngImageFile
 
 from jaxpose.datasets import lens
 from jaxpose.datasets.images import image_size, open_image, some
@@ -17,6 +18,7 @@ from jaxpose.errors import DataError
 from jaxpose.geometry import camera
 from jaxpose.geometry.camera import Camera
 
+_PNG_ORIENTATIONS = (b"eXIf", b"Raw profile type", b"XML:com.adobe.xmp")  # chunks of PNG that may hold it
 _SWAPPED = (5, 6, 7, 8)  # EXIF orientations by which width and height change places
 _MOST_SUBPIXELS = 4  # along each side of a pixel, where images are resampled
 _COARSER = 0.7  # resolution, by which images are reduced before
@@ -177,6 +179,11 @@ def _by_area(image: Image.Image, size: tuple[int, int]) -> np.ndarray:
 
 
 def _orientation(image: Image.Image) -> int:
+    # In a PNG it may stand behind the pixels, which Pillow decodes to look there.
+    if isinstance(image, PngImageFile):
+        content = Path(str(image.filename)).read_bytes()
+        if not any(name in content for name in _PNG_ORIENTATIONS):
+            return 1
     return int(image.getexif().get(ExifTags.Base.Orientation, 1))
 
 

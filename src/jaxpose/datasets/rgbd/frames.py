@@ -1,5 +1,6 @@
 """What formats of image files share: partners found by listing, and frames of files as a recording."""
 
+import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -97,13 +98,15 @@ class Listing:
 
     def __init__(self, root: Path):
         self.root, self._names = root, dict[Path, dict[str, Path]]()
+        self._exact = dict[str, set[str]]()
 
     def find(self, name: str) -> Path | None:
         """The file that a list names: with `\\` or `./`, in another case, or without its suffix."""
         if not may_exist(name):
             return None
-        if (file := self.root / name).is_file():
-            return file
+        folder, _, last = name.rpartition("/")
+        if last in self._files(folder):
+            return self.root / name
         found = self.root
         *folders, last = [part for part in name.replace("\\", "/").split("/") if part not in ("", ".")] or [
             ""
@@ -116,6 +119,16 @@ class Listing:
         names = self._below(found)
         candidates = (names.get(f"{last}{suffix}".lower()) for suffix in ("", *SUFFIXES))
         return next((file for file in candidates if file is not None and file.is_file()), None)
+
+    def _files(self, folder: str) -> set[str]:
+        """The names of all files in a folder below the root."""
+        if folder not in self._exact:
+            try:
+                with os.scandir(self.root / folder) as entries:
+                    self._exact[folder] = {entry.name for entry in entries if entry.is_file()}
+            except (OSError, ValueError):  # no such folder, and names that none has
+                self._exact[folder] = set()
+        return self._exact[folder]
 
     def _below(self, folder: Path) -> dict[str, Path]:
         if folder not in self._names:

@@ -79,7 +79,7 @@ def read_imu(file: Path | str) -> ImuFile:
     table = joined_clock(read_table(file))
     if not table.lines:
         raise DataError(f"{file}: expected lines of {_COLUMNS}, got none")
-    named, width = named_columns(table, _NAMES), len(table.words[0])
+    named, width = named_columns(table, _NAMES), len(table.words(0))
     if named is None and width != 7:
         raise DataError(
             f"{file}:{table.lines[0]}: expected {_COLUMNS}, or a header that names them, got {width} columns"
