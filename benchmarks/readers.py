@@ -96,7 +96,6 @@ def cases(made: Path, data: Path | None, events: int) -> dict[str, Callable[[], 
             f"{name}, frame 0": of_frames(data / name)
             for name in ("tum_fr1_rpy_first8s", "icl_nuim_kt3", "7scenes_redkitchen", "hololens_walk")
         },
-        "TUM fr1 lists": of("datasets.rgbd.tum:read_list", data / "tum_fr1_rpy_first8s/rgb.txt"),
         "EuRoC V1_01 IMU": of("datasets.rgbd.euroc:load_imu", data / "euroc_V1_01_easy"),
         "EuRoC V1_02 ground truth": of("datasets.rgbd.euroc:load_truth", data / "euroc_V1_02_medium"),
         "TUM fr2_desk ground truth": of(

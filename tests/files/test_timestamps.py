@@ -32,13 +32,13 @@ def test_what_no_clock_shows_is_no_timestamp(word):
 
 
 def test_lines_that_need_a_look_of_their_own_give_the_same_numbers(tmp_path):
-    rows = "1 0.5 -2e3\n2 inf 1\n3 7 8\n"
+    rows = "1 0.5 -2e3\n2 inf 1\n3 7 8\n" + "".join(f"{k} {k} {k}\n" for k in range(4, 100))
     (tmp_path / "a.txt").write_text(rows)
-    (tmp_path / "b.txt").write_text(rows.replace("3 7 8", "3 7 0_8 "))  # a number to Python only
+    (tmp_path / "b.txt").write_text(rows.replace("3 7 8", "3 7 0_8 ", 1))  # a number to Python only
     for read in (
         lambda file: read_numbers(file, "3 numbers", (3,), finite=False)[1].tolist(),
         lambda file: read_stamped(file, "3 numbers", 3, unit="s"),
     ):
         a, b = read(tmp_path / "a.txt"), read(tmp_path / "b.txt")
         assert str(a) == str(b)
-    assert b.lines == [1, 3] and b.missing == (2,) and b.values.tolist() == [[0.5, -2000], [7, 8]]
+    assert b.lines[:2] == [1, 3] and b.missing == (2,) and b.values[:2].tolist() == [[0.5, -2000], [7, 8]]

@@ -224,7 +224,7 @@ def natural_order(name: str) -> list[tuple[int, str]]:
 
 def may_exist(name: str) -> bool:
     """Whether a file system can hold a path of this name; of a longer one it says so as of a fault."""
-    return max(map(len, name.split("/"))) <= _LONGEST_NAME
+    return len(name) <= _LONGEST_NAME or max(map(len, name.split("/"))) <= _LONGEST_NAME
 
 
 _LONGEST_NAME = 255  # of a file, in any file system; and characters of an item of a list that are shown

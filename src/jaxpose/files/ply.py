@@ -75,7 +75,10 @@ def read_points(path: Path | str) -> Float[np.ndarray, "n 3"]:
         if there < count:
             raise DataError(f"{path}: expected {count} vertices, got {there}")
         vertices = np.fromfile(stream, kind, count)
-        return _near(path, np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1))
+        points = np.empty((count, 3))
+        for k, axis in enumerate("xyz"):
+            points[:, k] = vertices[axis]
+        return _near(path, points)
 
 
 def write_ply(

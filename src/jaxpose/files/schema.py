@@ -164,7 +164,8 @@ def name_inside(path: Path | str, name: str) -> str:
     Raises:
         DataError: for an absolute one, and for one with `..` in it.
     """
-    if not name or "\0" in name or name.startswith(("/", "\\")) or ".." in name.replace("\\", "/").split("/"):
+    leads_up = ".." in name and ".." in name.replace("\\", "/").split("/")
+    if not name or "\0" in name or name.startswith(("/", "\\")) or leads_up:
         raise DataError(f"{path}: expected a file name that stays in its folder, got {name!r:.60}")
     return name
 

@@ -20,6 +20,7 @@ from jaxpose.errors import DataError
 from jaxpose.files.schema import FARTHEST_M
 from jaxpose.files.timestamps import POSES, Stamps, Steps, Unit, format_ns, to_decimal, to_stamps, units
 
+_FEW = 50  # rows, of which each is sooner read by itself
 _NO_NUMBER = {"", "nan", "-nan", "null", "none", "na", "n/a"}  # how writers say that there is none
 
 
@@ -173,9 +174,9 @@ def _columns(table: Table, at: Sequence[int]) -> _Columns | None:
 
 def _numeric(rows: Sequence[str], separator: str | None) -> Float[np.ndarray, "n c"]:
     """Rows of as many numbers each; ValueError for others, and for what only Python takes for a number."""
-    if not all(rows):
+    if not rows or not all(rows):
         raise ValueError("rows with nothing in them")
-    return np.loadtxt(rows or ["none"], np.float64, comments=None, delimiter=separator, ndmin=2)
+    return np.loadtxt(rows, np.float64, comments=None, delimiter=separator, ndmin=2)
 
 
 def _numbers(path: Path, table: Table, columns: str, at: Sequence[int]) -> _Columns:
@@ -230,9 +231,10 @@ def read_numbers(
     numbered = numbered_lines(path)
     table = Table([number for number, _ in numbered], [line for _, line in numbered], separator)
     try:
-        found = _numeric(table.rows, separator)
-        if found.shape[1] in counts and (np.isfinite(found).all() or not finite):
-            return table.lines, found[:, : min(counts)]
+        if len(table.rows) > _FEW:
+            found = _numeric(table.rows, separator)
+            if found.shape[1] in counts and (np.isfinite(found).all() or not finite):
+                return table.lines, found[:, : min(counts)]
     except ValueError:
         pass
     return _read_lines(path, table, columns, counts, finite)

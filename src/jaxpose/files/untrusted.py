@@ -329,9 +329,10 @@ def opened_image(path: Path | str) -> Iterator[Any]:
     if not os.path.isfile(path):
         raise DataError(f"{path}: expected an image, got nothing")
     with reading(path, "an image"), Image.open(path, formats=_FORMATS) as image:
+        width, height = image.size
         size = os.path.getsize(path)
-        if not 0 < image.width * image.height <= min(_PIXELS, _PIXELS_PER_BYTE * size):
-            raise ValueError(f"{image.width}x{image.height} pixels in {size} bytes")
+        if not 0 < width * height <= min(_PIXELS, _PIXELS_PER_BYTE * size):
+            raise ValueError(f"{width}x{height} pixels in {size} bytes")
         yield image
 
 

@@ -252,3 +252,28 @@ def test_csv_that_cannot_be_read(tmp_path):
         file.write_text(text)
         with pytest.raises(DataError, match=message):
             registry.load_events(file, size=SIZE)
+
+
+def test_a_packet_of_aedat4_is_no_longer_than_its_file(tmp_path):
+    """The package allots what a length asks for, and panics, which is no Exception, where text is none."""
+    options = dv.io.MonoCameraWriter.EventOnlyConfig("DAVIS", (346, 260))
+    writer, store = dv.io.MonoCameraWriter(str(tmp_path / "a.aedat4"), options), dv.EventStore()
+    for t, x, y, p in events(50, start=1_700_000_000_000_000, size=(346, 260)).tolist():
+        store.push_back(t, x, y, bool(p))
+    writer.writeEvents(store)
+    del writer
+    content = (tmp_path / "a.aedat4").read_bytes()
+    at = 14 + 4 + int.from_bytes(content[14:18], "little") + 4  # the length of the first packet
+    damaged = content[:at] + b"\xff\xff\xff\x7f" + content[at + 4 :]
+    middle = content.index(b"<")
+    for k, bad in enumerate((damaged, content[:middle] + b"\xff" + content[middle + 1 :])):
+        (tmp_path / f"{k}.aedat4").write_bytes(bad)
+        with pytest.raises(DataError, match=f"{k}.aedat4: expected an AEDAT 4 file, got") as error:
+            registry.load_events(tmp_path / f"{k}.aedat4")
+        assert "\n" not in str(error.value)
+
+
+def test_the_layout_of_evt21_is_found_in_a_file_that_ends_within_a_word(tmp_path):
+    file = write(tmp_path, "unsaid", events(50))
+    file.write_bytes(file.read_bytes()[:-3])
+    assert len(registry.load_events(file, size=SIZE).events.t) >= 40

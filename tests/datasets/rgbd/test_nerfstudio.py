@@ -65,6 +65,7 @@ def test_times_arrays_and_missing_frames(tmp_path, walk, save, metres):
         ({"w": 64}, {}, "expected the size of the images, 32x24, got 64x24"),
         ({"k4": 0.1}, {}, "expected a lens of k1 k2 p1 p2 k3, got k4 0.1"),
         ({}, {"transform_matrix": [[1, 2]]}, "transform_matrix: expected 4x4 finite numbers"),
+        ({}, {"transform_matrix": 0.5}, "transform_matrix: expected 4x4 finite numbers"),
         ({}, {"file_path": 3}, "file_path: expected"),
     ],
 )

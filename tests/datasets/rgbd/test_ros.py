@@ -1,6 +1,7 @@
 """Bags that the package rosbags writes, with known images, lens, motion and readings, read back."""
 
 import struct
+import tracemalloc
 
 import cv2
 import numpy as np
@@ -380,3 +381,22 @@ def test_without_the_package_the_extra_is_named(tmp_path, walk, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "rosbags.highlevel", None)
     with pytest.raises(DataError, match=r'needs the package rosbags: pip install -e ".\[ros\]"'):
         ros.load(path)
+
+
+@pytest.mark.parametrize("kind", ["ros1", "mcap"])
+def test_a_length_in_a_bag_allots_no_more_than_the_bag_holds(tmp_path, walk, kind):
+    """An index that begins 3 bytes late: what is there is read as a length of gigabytes or exabytes."""
+    make = Maker(kind)
+    path = make.write(tmp_path, messages(make, walk))
+    file = path if path.is_file() else next(path.glob("*.mcap"))
+    content = bytearray(file.read_bytes())
+    at = content.index(b"index_pos=") + 10 if kind == "ros1" else len(content) - 28  # of the footer
+    (place,) = struct.unpack_from("<Q", content, at)
+    struct.pack_into("<Q", content, at, place + 3)
+    file.write_bytes(content)
+    tracemalloc.start()
+    with pytest.raises(DataError, match="expected a ROS bag: .*, got a damaged one"):
+        ros.load(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 50e6

@@ -1,6 +1,8 @@
 """AEDAT 4 files of iniVation's cameras, by the package `aedat` (extra `events`)."""
 
+import struct
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from jaxpose.datasets.events.stream import Block, Stream
@@ -11,23 +13,22 @@ MAGIC = b"#!AER-DAT4.0"
 
 def aedat4_stream(file: Path) -> Stream:
     """The events of an AEDAT 4 file, of its first stream of them; timestamps are microseconds since 1970."""
-    streams = {
-        number: about for number, about in _decoder(file).id_to_stream().items() if about["type"] == "events"
-    }
+    with _panics_named(file):
+        _check_lengths(file)
+        found = _decoder(file).id_to_stream()
+    streams = {number: about for number, about in found.items() if about["type"] == "events"}
     if not streams:
         raise DataError(f"{file}: expected a stream of events, got none")
     first = min(streams)
 
     def blocks() -> Iterator[Block]:
-        try:
+        with _panics_named(file):
             for packet in _decoder(file):
                 if packet["stream_id"] == first and "events" in packet:
                     events = packet["events"]
                     # Views of the packet's own structure: copied, so that it can be let go.
                     t, x, y = (events[name].copy() for name in ("t", "x", "y"))
                     yield Block(t, x, y, events["on"].astype("i1"))
-        except (RuntimeError, ValueError) as error:
-            raise DataError(f"{file}: expected a whole AEDAT 4 file, got {_words(error)}") from None
 
     def notes() -> tuple[str, ...]:
         others = len(streams) - 1
@@ -44,11 +45,41 @@ def _decoder(file: Path):  # noqa: ANN202 - of a package that may lack
         raise DataError(
             f"{file}: expected the package aedat to read it, got none: pip install 'jaxpose[events]'"
         ) from None
+    return aedat.Decoder(file)
+
+
+@contextmanager
+def _panics_named(file: Path) -> Iterator[None]:
+    """DataError for whatever the package makes of a damaged file, its panics too, which are no Exception."""
     try:
-        return aedat.Decoder(file)
-    except Exception as error:  # the package raises its own on damaged files
-        raise DataError(f"{file}: expected an AEDAT 4 file, got {_words(error)}") from None
+        yield
+    except DataError:
+        raise
+    except BaseException as error:
+        if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
+            raise
+        words = " ".join(str(error).split())[:80]
+        raise DataError(f"{file}: expected an AEDAT 4 file, got {words}") from None
 
 
-def _words(error: Exception) -> str:
-    return " ".join(str(error).split())[:80]
+def _check_lengths(file: Path) -> None:
+    """ValueError for a packet that is longer than the file: the package allots what a packet asks for."""
+    end = file.stat().st_size
+    with file.open("rb") as stream:
+        stream.seek(len(MAGIC) + len("\r\n"))
+        (length,) = struct.unpack("<I", stream.read(4))
+        if length > end:
+            raise ValueError(f"a header of {length} bytes")
+        header = stream.read(length)
+        # FlatBuffers: the table, its vtable, and of that the second entry, where the table of packets begins.
+        (table,) = struct.unpack_from("<I", header)
+        (back,) = struct.unpack_from("<i", header, table)
+        size, _, _, place = struct.unpack_from("<4H", header + bytes(8), table - back)
+        if size >= 8 and place:
+            (packets_end,) = struct.unpack_from("<q", header, table + place)
+            end = packets_end if 0 <= packets_end < end else end
+        while (at := stream.tell()) + 8 <= end:
+            _, length = struct.unpack("<iI", stream.read(8))
+            if length > end - at - 8:
+                raise ValueError(f"a packet of {length} bytes at {at}, where {end - at - 8} are left")
+            stream.seek(length, 1)

@@ -105,7 +105,8 @@ def _decoder(file: Path, header: str, stream: BinaryIO) -> type[_Decoder]:
     endianness = re.search(r"endianness=(\w+)", header, re.I)
     if endianness:
         return Evt21Swapped if endianness[1].lower() == "legacy" else Evt21
-    words = np.frombuffer(stream.read(8 * _LAYOUT_WORDS), "<u8")
+    content = stream.read(8 * _LAYOUT_WORDS)
+    words = np.frombuffer(content, "<u8", len(content) // 8)
     # Words of time are of type 8, in the upper bits of that half which has the types.
     upper, lower = (int((((words >> np.uint64(place)) & np.uint64(15)) == 8).sum()) for place in (60, 28))
     return Evt21Swapped if lower > upper else Evt21

@@ -120,7 +120,8 @@ def _times(file: Path, frames: list[dict[str, Any]]) -> np.ndarray | None:
 
 
 def _pose(file: Path, frame: dict[str, Any]) -> np.ndarray:
-    rows = 3 if len(frame.get("transform_matrix") or ()) == 3 else 4
+    matrix = frame.get("transform_matrix")
+    rows = 3 if isinstance(matrix, list) and len(matrix) == 3 else 4
     T = np.eye(4)
     T[:rows] = numbers(file, frame, "transform_matrix", (rows, 4))
     return T

@@ -1,5 +1,7 @@
 """Bags of ROS 1 and ROS 2 (sqlite3, MCAP) through the package `rosbags`: topics and their messages."""
 
+import io
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,6 +13,26 @@ _MAGIC = {b"#ROSBAG V2.0": ".bag", b"\x89MCAP0\r\n": ".mcap", b"SQLite format 3\
 _METADATA = "metadata.yaml"
 _KINDS = "a ROS bag: .bag, .mcap, .db3, or a folder with metadata.yaml"
 EXTRA = 'pip install -e ".[ros]"'
+
+
+class _Clamped(io.BufferedReader):
+    """A file that allots no more than it holds, whatever size a damaged length asks for."""
+
+    def __init__(self, path: Path):
+        super().__init__(io.FileIO(path))
+        self._size = os.fstat(self.fileno()).st_size
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        if size is None or size < 0:
+            return super().read(size)
+        return super().read(min(size, max(self._size - self.tell(), 0)))
+
+
+class _ClampedPath(type(Path())):
+    """A path whose binary files are such; `rosbags` takes paths of any kind."""
+
+    def open(self, mode: str = "r", *args: Any, **options: Any) -> Any:
+        return _Clamped(self) if mode == "rb" else super().open(mode, *args, **options)
 
 
 class Topic(NamedTuple):
@@ -63,15 +85,16 @@ class Bag:
             raise DataError(f"{path}: a ROS bag needs the package rosbags: {EXTRA}") from None
         try:
             # Bags of ROS 2 before Iron do not hold the definitions of their types.
-            self._reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+            store = get_typestore(Stores.ROS2_HUMBLE)
+            self._reader = AnyReader([_ClampedPath(path)], default_typestore=store)
             self._reader.open()
+            self.topics = {
+                name: Topic(name, (info.msgtype or "").rsplit("/", 1)[-1], info.msgcount)
+                for name, info in self._reader.topics.items()
+                if info.msgcount
+            }
         except Exception as error:  # each storage raises its own kinds on damaged files
             raise self._damaged(error) from None
-        self.topics = {
-            name: Topic(name, (info.msgtype or "").rsplit("/", 1)[-1], info.msgcount)
-            for name, info in self._reader.topics.items()
-            if info.msgcount
-        }
         if not self.topics:
             raise DataError(f"{path}: expected messages in the bag, got none")
 
