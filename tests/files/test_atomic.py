@@ -13,6 +13,13 @@ from jaxpose.files import run_folder
 from jaxpose.files.atomic import atomic, write_text
 
 
+def test_a_link_that_leads_to_itself_is_refused(tmp_path):
+    (tmp_path / "loop.txt").symlink_to("loop.txt")
+    with pytest.raises(DataError, match="loop.txt: expected a file to write, got a link"):
+        write_text(tmp_path / "loop.txt", "new")
+    assert (tmp_path / "loop.txt").is_symlink()
+
+
 def test_a_link_is_followed(tmp_path):
     (tmp_path / "disk").mkdir()
     (tmp_path / "disk" / "there.txt").write_text("old")

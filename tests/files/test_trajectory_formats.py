@@ -105,3 +105,11 @@ def test_stamps_of_lists_and_tables(tmp_path):
         file.write_text(text)
         with pytest.raises(DataError, match=message):
             trajectories.read_timestamps(file)
+
+
+@pytest.mark.parametrize("mark", ["[", "(", "[(", "<qw>", "#[", "."])
+def test_a_line_too_long_for_names_is_no_header(tmp_path, mark):
+    """Regular expressions that look for names would look to its end from every bracket: for minutes."""
+    (tmp_path / "a.txt").write_text(mark * 100_000 + "\n0 1 2 3 0 0 0 1\n1 1 2 3 0 0 0 1\n")
+    found = trajectories.read_trajectory(tmp_path / "a.txt")
+    assert found.format == "TUM" and found.trajectory.t.tolist() == [0, 1]

@@ -12,6 +12,7 @@ import json
 import re
 import resource
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -24,7 +25,8 @@ from random import Random
 from typing import Any
 
 sys.path.insert(1, str(Path(__file__).parents[1]))  # what tests share
-SLOWEST_S, MOST_BYTES, DEAD_S = 10.0, 1 << 30, 30.0
+SLOWEST_S, MOST_BYTES = 10.0, 1 << 30
+DEAD_S, ASLEEP_S = 30.0, 600.0  # of the processor, and of the clock, after which a case is ended
 
 
 def numbers_of(value: Any):
@@ -96,14 +98,17 @@ def work(names: list[str], seed: int, first: int, seconds: float) -> None:
             fault = fault_of(targets.TARGETS[name], originals[name])
             assert fault is None, f"{name}, undamaged: {fault}"
         _limit_memory()
+        faulthandler.register(signal.SIGPROF, chain=True)  # then it ends the process
         copy, number = Path(where) / "case", first
         while time.monotonic() < ends:
             name = names[number % len(names)]
             print(json.dumps({"case": number}), flush=True)
             shutil.copytree(originals[name], copy)
             file = damage(name, number, seed, copy)
-            faulthandler.dump_traceback_later(DEAD_S, exit=True)
+            faulthandler.dump_traceback_later(ASLEEP_S, exit=True)
+            signal.setitimer(signal.ITIMER_PROF, DEAD_S)
             fault = fault_of(targets.TARGETS[name], copy)
+            signal.setitimer(signal.ITIMER_PROF, 0)
             faulthandler.cancel_dump_traceback_later()
             if fault:
                 print(

@@ -1,6 +1,7 @@
 """Checks that the configs of commands share: numbers, folders, options that would do nothing."""
 
 import math
+import os
 from collections.abc import Collection, Mapping
 from operator import attrgetter
 from pathlib import Path
@@ -116,7 +117,7 @@ def _same(a: Path, b: Path) -> bool:
     try:
         return a.samefile(b)
     except OSError:  # one of them is not there
-        return a.resolve() == b.resolve()
+        return os.path.realpath(a) == os.path.realpath(b)
 
 
 def check_unused(config: Any, names: Collection[str], why: str) -> None:

@@ -27,7 +27,9 @@ def atomic(path: Path | str) -> Iterator[Path]:
     other. A link is followed; DataError for what is no file, as a device; OSError names the path.
     """
     path = Path(path)
-    place = path.resolve() if path.is_symlink() else path
+    place = Path(os.path.realpath(path)) if path.is_symlink() else path
+    if place.is_symlink():
+        raise DataError(f"{path}: expected a file to write, got a link that leads to itself")
     if place.exists() and not place.is_file():
         raise DataError(
             f"{path}: expected a file to write, got {'a folder' if place.is_dir() else 'a device'}"

@@ -19,6 +19,7 @@ _UNITS: dict[Unit, str] = {
     "us": r"us|usecs?|microseconds?|micros",
     "ns": r"ns|nsecs?|nanoseconds?|nanos",
 }
+_LONGEST_HEADER = 4000  # characters; what is longer is no list of names
 _PATHS = ("position", "orientation", "translation", "rotation", "linear_acceleration", "angular_velocity")
 
 
@@ -41,6 +42,8 @@ def named_columns(table: Table, wanted: Mapping[str, str]) -> Named | None:
         The columns; None unless a header names all that are wanted.
     """
     for header in table.headers:
+        if len(header) > _LONGEST_HEADER:
+            continue
         text = re.sub(r"^(fields|columns|format)\s*:?\s+", "", header, flags=re.IGNORECASE)
         named = match_names(_split(text, table.separator), wanted)
         if named is not None and len(_split(text, table.separator)) == len(table.words(0)):
@@ -113,6 +116,8 @@ def _unit(text: str) -> Unit | None:
 def joined_clock(table: Table) -> Table:
     """A table whose timestamps are in two columns, `sec` and `nsec`, with one of decimal seconds instead."""
     for k, header in enumerate(table.headers):
+        if len(header) > _LONGEST_HEADER:
+            continue
         names = [_plain(name)[0] for name in _split(header, table.separator)]
         first = next((i for i in range(len(names) - 1) if _is_clock(names[i], names[i + 1])), None)
         if first is None or len(names) != len(table.words(0)):

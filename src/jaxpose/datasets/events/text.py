@@ -14,6 +14,7 @@ from jaxpose.errors import DataError
 _COLUMNS = "4 numbers (t x y p)"
 _EXACT_DIGITS = 15  # of a whole number in float64
 _LOOKED_AT = 50  # lines at the top
+_LONGEST = 4000  # characters of them
 # The names that headers give the four, by their first letters.
 _NAMES = {
     "t": ("t", "ts", "time", "timestamp", "timestamps"),
@@ -71,7 +72,7 @@ def _form(file: Path) -> _Form:
     size, unit, header, rows, separator, above = None, None, None, [], None, 0
     with file.open(encoding="utf-8-sig", errors="replace") as lines:
         for number, line in zip(range(_LOOKED_AT), lines, strict=False):
-            text = line.strip()
+            text = line.strip()[:_LONGEST]
             comment = text[:1] in ("#", "%")
             if found := re.match(r"[#%] *geometry *[:=]? *(\d+) *[,x] *(\d+)", text, re.I):
                 size = int(found[1]), int(found[2])
