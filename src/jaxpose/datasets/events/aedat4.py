@@ -43,7 +43,7 @@ def _decoder(file: Path):  # noqa: ANN202 - of a package that may lack
         import aedat
     except ImportError:
         raise DataError(
-            f"{file}: expected the package aedat to read it, got none: pip install 'jaxpose[events]'"
+            f'{file}: expected the package aedat to read it, got none: pip install -e ".[events]"'
         ) from None
     return aedat.Decoder(file)
 
