@@ -17,7 +17,7 @@ from PIL import Image
 from scipy.interpolate import CubicSpline
 
 from jaxpose.errors import DataError
-from jaxpose.experiments.planar import alignment
+from jaxpose.experiments.planar import alignment, pyramid
 from jaxpose.experiments.planar import pipeline as planar
 from jaxpose.experiments.planar import task as planar_task
 from jaxpose.experiments.planar import warps as planar_warps
@@ -212,23 +212,18 @@ def test_the_reset_is_the_least_squares_natural_spline():
 # --- alignment ------------------------------------------------------------------------------------------
 
 
-def aligned(pose, photo, steps=200, **moved):
-    """A motion found from the identity by a small image network."""
-    patches = 3
-    motion = [np.array(moved.get(k, (0.0, 0.0, 0.0))) for k in ("x", "y", "angle")]
-    H = planar_task.rigid(*motion)
-    task = planar_task.Task(H, planar_task.cut(photo, H))
-    warps = planar_warps.motion_warps(pose, patches, PoseNetConfig(layers=4, width=64))
-    scene = image(ImageConfig(octaves=4, layers=3, width=64))
-    compiled = alignment.aligner(photo, scene, warps, steps=steps, points=128)
-    return alignment.align(compiled, photo, task, jax.random.key(0), steps), task, compiled
+def moved_patches(photo, H):
+    return planar_task.Task(H, planar_task.cut(photo, H))
 
 
 @pytest.mark.parametrize("pose", ["posenet", "per_frame"])
 def test_small_motions_are_found(pose):
     photo = Photo(blobs() / 255, 32)
-    moved = dict(x=(0, 0.08, 0.12), y=(0, -0.06, 0.05), angle=(0, 0.1, -0.15))
-    found, task, compiled = aligned(pose, photo, steps=600, **moved)
+    moved = [np.array(v) for v in ((0, 0.08, 0.12), (0, -0.06, 0.05), (0, 0.1, -0.15))]
+    task = moved_patches(photo, planar_task.rigid(*moved))
+    warps = planar_warps.motion_warps(pose, 3, PoseNetConfig(layers=4, width=64))
+    scene = image(ImageConfig(octaves=4, layers=3, width=64))
+    found = alignment.by_adam(photo, scene, warps, steps=600, points=128)(task, jax.random.key(0))
     assert found.corner_px[0] > 5
     assert found.corner_px[-1] < 0.5
     errors = planar_task.corner_errors(photo, found.H_image_patch, task.H_image_patch)
@@ -237,8 +232,43 @@ def test_small_motions_are_found(pose):
     assert len(found.loss) == 12 and found.loss[-1] < 0.05 * found.loss[0]
     assert found.psnr > 25
     seen = planar_task.covered(photo, task.H_image_patch)
-    neural = alignment.picture(compiled, photo, found)
-    assert -10 * np.log10(np.mean((neural - photo.rgb)[seen] ** 2)) > 24, "the picture is the photograph"
+    assert alignment.psnr((found.picture - photo.rgb)[seen]) > 24, "the picture is the photograph"
+
+
+def test_the_pyramid_finds_motions_to_a_hundredth_of_a_pixel():
+    photo = Photo(blobs() / 255, 32)
+    moved = [np.array(v) for v in ((0, 0.08, 0.12, 0.1), (0, -0.06, 0.05, 0.1), (0, 0.1, -0.15, -0.2))]
+    warps, told = planar_warps.motion_warps("posenet", 4, NET), []
+    task = moved_patches(photo, planar_task.rigid(*moved))
+    found = pyramid.by_gauss_newton(photo, warps)(task, jax.random.key(0), lambda *now: told.append(now))
+    errors = planar_task.corner_errors(photo, found.H_image_patch, task.H_image_patch)
+    assert found.corner_px[0] > 5 and errors.max() < 0.02
+    assert found.corner_px[-1] == pytest.approx(errors[1:].mean())
+    assert [step for step, *_ in told] == list(range(1, pyramid.count(photo.crop) + 1))
+    assert len(found.loss) == len(told) and found.loss[-1] < 1e-2 * found.loss[-pyramid.STEPS]
+    assert found.psnr > 60
+    seen = planar_task.covered(photo, task.H_image_patch)
+    assert alignment.psnr((found.picture - photo.rgb)[seen]) > 40, "the picture is the photograph"
+
+
+def test_the_pyramid_says_so_where_nothing_can_be_found():
+    """A photograph of one colour: no step is taken and nothing is not a number."""
+    photo = Photo(np.full((64, 96, 3), 0.5), 32)
+    task = moved_patches(photo, planar_task.rigid(np.array([0, 0.1]), np.zeros(2), np.zeros(2)))
+    warps = planar_warps.motion_warps("per_frame", 2, NET)
+    found = pyramid.by_gauss_newton(photo, warps)(task, jax.random.key(0))
+    assert_allclose(found.H_image_patch, np.tile(np.eye(3), (2, 1, 1)), atol=1e-6)
+    assert found.corner_px[-1] == pytest.approx(0.1 * 48, rel=1e-4)
+
+
+def test_a_steps_derivatives_are_those_of_the_points():
+    q = np.random.default_rng(0).normal(0, 0.2, (3, 3))
+    xy = np.array([[0.3, -0.7], [0.1, 0.2]])
+    at = lambda q: planar_task.apply(planar_task.rigid(*q.T), xy)
+    expected = np.stack([(at(q + step) - at(q - step)) / 2e-6 for step in 1e-6 * np.eye(3)], axis=1)
+    assert_allclose(pyramid._derivatives(q, xy), expected, atol=1e-9)
+    turned = jnp.asarray(planar_task.rigid(*q.T), jnp.float32)
+    assert_allclose(planar_warps.coordinates(turned), q, atol=1e-6)
 
 
 # --- the command ----------------------------------------------------------------------------------------
@@ -297,12 +327,15 @@ def test_a_killed_run_resumed_has_the_numbers_of_a_whole_one(photograph, tmp_pat
 def found_at_once(monkeypatch):
     """Alignment without work: the ground truth, 0.5 px off in x."""
 
-    def quick(compiled, photo, task, key, steps, on_chunk=None):
-        H = task.H_image_patch + np.eye(3)[0][:, None] * np.eye(3)[2] * 0.5 / photo.unit
-        params = image(planar._SMOKE_IMAGE).init(key)
-        return alignment.Aligned(params, H, np.ones(2), np.array([40, 2, 0.5]), 31.0)
+    def quick(photo, *_, **__):
+        def align(task, key, on_step=None):
+            H = task.H_image_patch + np.eye(3)[0][:, None] * np.eye(3)[2] * 0.5 / photo.unit
+            return alignment.Aligned(photo.rgb, H, np.ones(2), np.array([40, 2, 0.5]), 31.0)
 
-    monkeypatch.setattr(alignment, "align", quick)
+        return align
+
+    monkeypatch.setattr(alignment, "by_adam", quick)
+    monkeypatch.setattr(pyramid, "by_gauss_newton", quick)
 
 
 def test_compare_puts_all_pose_fields_side_by_side(found_at_once, photograph, tmp_path):
@@ -330,6 +363,13 @@ def test_homographies(found_at_once, photograph, tmp_path):
     )
     assert outcome.results["pose"] == "per_frame" and outcome.results["protocol"]["patches"] == 5
     assert "homography set-up, 5 patches of 32 px" in report(*outcome)
+    assert "preset paper, 100 steps" in report(*outcome)
+
+
+def test_the_protocol_of_the_pyramid(found_at_once, photograph, tmp_path):
+    outcome = planar.run(planar.Config(image=photograph, motions=1, out=tmp_path / "fast"))
+    assert "preset fast, 12 steps" in report(*outcome)
+    assert outcome.results["protocol"]["blurs_px"] == pytest.approx([64 / 15, 32 / 15, 0])
 
 
 @pytest.mark.parametrize(
@@ -340,6 +380,9 @@ def test_homographies(found_at_once, photograph, tmp_path):
         (["--motions", "0"], r"--motions: expected at least 1, got 0"),
         (["--points", "0"], r"--points: expected at least 1, got 0"),
         (["--steps", "120"], r"--steps: expected a multiple of 50, got 120"),
+        (["--steps", "100"], r"--steps.*preset fast"),
+        (["--preset", "fast", "--compare"], r"--preset fast: expected none of --compare"),
+        (["--preset", "fast", "--pose", "spline_reset"], r"--preset fast: expected none of"),
         (["--seed", "-1"], r"--seed: expected at least 0, got -1"),
         (["--setup", "homography", "--pose", "posenet"], r"homography: expected --pose per_frame"),
         (["--setup", "homography", "--compare"], r"homography: expected --pose per_frame and no --compare"),

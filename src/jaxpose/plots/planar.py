@@ -1,4 +1,4 @@
-"""Pictures of planar alignment: the neural image with its patches, and corner errors over steps."""
+"""Pictures of planar alignment: the image that was found with its patches, and corner errors over steps."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,23 +15,23 @@ from jaxpose.plots.style import DPI, ESTIMATE, LOST, STYLE, save
 
 _GROUND_TRUTH, _START, _ESTIMATE = "#ffffff", "#f5c518", "#35c8f5"  # over a photograph, not over paper
 _FIELDS = {"posenet": ESTIMATE, "per_frame": "#e0902f", "spline_reset": "#b5322d", "bspline": "#5a9e5a"}
-_FLOOR = 1e-3  # [px] of a logarithmic axis
+_FLOOR = 1e-4  # [px] of a logarithmic axis
 
 
 def reconstruction(
     path: Path | str,
     photograph: Float[np.ndarray, "h w 3"],
-    neural: Float[np.ndarray, "h w 3"],
+    found: Float[np.ndarray, "h w 3"],
     covered: Bool[np.ndarray, "h w"],
     outlines: Mapping[str, Float[np.ndarray, "n 4 2"]],
     title: str,
 ) -> None:
-    """A photograph with the outlines of its patches beside the neural image that was made from them.
+    """A photograph with the outlines of its patches beside the image that was found with them.
 
     Args:
         path: PNG to write.
         photograph: colours in [0, 1].
-        neural: colours in [0, 1].
+        found: colours in [0, 1].
         covered: pixels that a patch covers; the others, of which nothing is known, are faded in both.
         outlines: corners [px] of the patches, under the names ground_truth, start and estimate.
         title: of the figure.
@@ -45,7 +45,7 @@ def reconstruction(
         left, right = figure.subplots(1, 2)
         for axes, picture, drawn, name in (
             (left, photograph, ("ground_truth", "estimate", "start"), "photograph, patches on it"),
-            (right, neural, ("estimate",), "neural image, from the patches alone"),
+            (right, found, ("estimate",), "image found, from the patches alone"),
         ):
             axes.imshow(np.clip(picture, 0, 1) * fade, interpolation="nearest")
             for key in drawn:

@@ -1,7 +1,7 @@
 """Image and warps optimised together, in compiled chunks of steps that all motions share."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxpose import fields, optim
+from jaxpose.experiments.planar import task as planar_task
 from jaxpose.experiments.planar.task import Photo, Task, corner_errors, pixels
 from jaxpose.experiments.planar.warps import RESET_EVERY, Warps, apply
 from jaxpose.scenes import ImageField
@@ -18,19 +19,27 @@ CHUNK = 50  # steps in one compiled call
 _IMAGE_RATE = 1e-3  # Adam's, constant: BARF's
 _ROWS = 4096  # points of the image queried at once where it is drawn or measured
 
-OnChunk = Callable[[int, float, float], None]  # steps done, loss, mean corner error [px]
+OnStep = Callable[[int, float, float], None]  # steps done, loss, mean corner error [px]
 
 
 class Aligned(NamedTuple):
     """Where the optimisation of one motion ended, and how it went there."""
 
-    image: Any  # parameters of the image
+    picture: Float[np.ndarray, "h w 3"]  # the image that was found, on the pixels of the photograph
     H_image_patch: Float[np.ndarray, "n 3 3"]
-    loss: Float[np.ndarray, " c"]  # mean over each chunk of steps
-    corner_px: Float[
-        np.ndarray, " c+1"
-    ]  # mean over the patches that may move, at the start and after each chunk
+    loss: Float[np.ndarray, " c"]  # after each step, or mean over each chunk of steps
+    corner_px: Float[np.ndarray, " c+1"]  # mean over the patches that may move, at the start and then
     psnr: float  # of all pixels of all patches [dB]
+
+
+@runtime_checkable
+class Align(Protocol):
+    """Find the warps of one motion from the identity.
+
+    What is found depends on `key` and on nothing that ran before.
+    """
+
+    def __call__(self, task: Task, key: PRNGKeyArray, on_step: OnStep | None = None, /) -> Aligned: ...
 
 
 class _State(NamedTuple):
@@ -47,7 +56,55 @@ class Aligner(NamedTuple):
     advance: Callable[[_State, Float[Array, "n p 3"], Float[Array, ""]], tuple[_State, Float[Array, ""]]]
     warps: Callable[[Any], Float[Array, "n 3 3"]]
     colours: Callable[[Any, Float[Array, "k 2"]], Float[Array, "k 3"]]
-    points: Float[np.ndarray, "p 2"]
+
+
+def by_adam(photo: Photo, image: ImageField, warps: Warps, *, steps: int, points: int) -> Align:
+    """The paper's alignment: a neural image and the warps optimised together by Adam.
+
+    Args:
+        photo: the photograph of the patches.
+        image: the neural image.
+        warps: the warps, and Adam's rates for them.
+        steps: a multiple of CHUNK; coarse-to-fine window and rates refer to it.
+        points: random pixels of each patch in a step.
+
+    Returns:
+        The alignment, compiled once for all motions.
+    """
+    compiled = aligner(photo, image, warps, steps=steps, points=points)
+
+    def align(task: Task, key: PRNGKeyArray, on_step: OnStep | None = None, /) -> Aligned:
+        state, rgb = compiled.start(key), jnp.asarray(task.rgb, jnp.float32)
+
+        def corner_px():
+            estimate = np.asarray(compiled.warps(state.pose), np.float64)
+            return float(corner_errors(photo, estimate, task.H_image_patch)[1:].mean())
+
+        losses, curve = [], [corner_px()]
+        for first in range(0, steps, CHUNK):
+            state, value = compiled.advance(state, rgb, jnp.asarray(first))
+            losses.append(float(value))
+            curve.append(corner_px())
+            if on_step is not None:
+                on_step(first + CHUNK, losses[-1], curve[-1])
+        params = fields.set_progress(state.image, jnp.ones(()))
+        H = np.asarray(compiled.warps(state.pose), np.float64)
+
+        def colours(xy):
+            return np.asarray(
+                compiled.colours(params, jnp.asarray(xy.reshape(-1, 2), jnp.float32)), np.float64
+            )
+
+        error = colours(planar_task.apply(H, pixels(photo))) - task.rgb.reshape(-1, 3)
+        picture = colours(photo.pixels).reshape(photo.rgb.shape)
+        return Aligned(picture, H, np.array(losses), np.array(curve), psnr(error))
+
+    return align
+
+
+def psnr(error: Float[np.ndarray, "p 3"]) -> float:
+    """Of errors of colours in [0, 1] [dB]; at most 140, which is float32's rounding."""
+    return float(-10 * np.log10(max(np.mean(error**2), 1e-14)))
 
 
 def aligner(photo: Photo, image: ImageField, warps: Warps, *, steps: int, points: int) -> Aligner:
@@ -90,46 +147,7 @@ def aligner(photo: Photo, image: ImageField, warps: Warps, *, steps: int, points
     def colours(params, xy):
         return jax.lax.map(lambda point: image.query(params, point), xy, batch_size=_ROWS)
 
-    return Aligner(jax.jit(start), jax.jit(advance), jax.jit(warps.warps), jax.jit(colours), grid)
-
-
-def align(
-    compiled: Aligner,
-    photo: Photo,
-    task: Task,
-    key: PRNGKeyArray,
-    steps: int,
-    on_chunk: OnChunk | None = None,
-) -> Aligned:
-    """Optimise one motion from the identity; the numbers depend on `key` and on nothing that ran before."""
-    state, rgb = compiled.start(key), jnp.asarray(task.rgb, jnp.float32)
-
-    def corner_px():
-        estimate = np.asarray(compiled.warps(state.pose), np.float64)
-        return float(corner_errors(photo, estimate, task.H_image_patch)[1:].mean())
-
-    losses, curve = [], [corner_px()]
-    for first in range(0, steps, CHUNK):
-        state, value = compiled.advance(state, rgb, jnp.asarray(first))
-        losses.append(float(value))
-        curve.append(corner_px())
-        if on_chunk is not None:
-            on_chunk(first + CHUNK, losses[-1], curve[-1])
-    image = fields.set_progress(state.image, jnp.ones(()))
-    warps = compiled.warps(state.pose)
-    place = jax.vmap(jax.vmap(apply, (None, 0)), (0, None))(warps, jnp.asarray(compiled.points, jnp.float32))
-    error = np.asarray(compiled.colours(image, place.reshape(-1, 2)), np.float64) - task.rgb.reshape(-1, 3)
-    psnr = float(-10 * np.log10(np.mean(error**2)))
-    return Aligned(image, np.asarray(warps, np.float64), np.array(losses), np.array(curve), psnr)
-
-
-def picture(compiled: Aligner, photo: Photo, aligned: Aligned) -> Float[np.ndarray, "h w 3"]:
-    """The neural image on the pixels of the photograph, in [0, 1]."""
-    height, width = photo.rgb.shape[:2]
-    x, y = (np.arange(width) + 0.5 - width / 2), (np.arange(height) + 0.5 - height / 2)
-    xy = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2) / photo.unit
-    colours = compiled.colours(aligned.image, jnp.asarray(xy, jnp.float32))
-    return np.asarray(colours, np.float64).reshape(height, width, 3)
+    return Aligner(jax.jit(start), jax.jit(advance), jax.jit(warps.warps), jax.jit(colours))
 
 
 def _query(image: ImageField, params: Any, place: Float[Array, "n k 2"]) -> Float[Array, "n k 3"]:

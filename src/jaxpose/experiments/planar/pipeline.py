@@ -1,8 +1,8 @@
-"""Planar alignment: the motions of patches of one photograph, and the neural image that they make together.
+"""Planar alignment: the motions of patches of one photograph, and the image that they make together.
 
 Without options: 20 motions of the paper's set-up on a photograph that matplotlib ships, PoseNet, a run
-folder under outputs/planar. `--setup homography` is BARF's own set-up, `--compare` puts all pose fields side
-by side.
+folder under outputs/planar. `--preset paper` optimises a neural image along, as the paper does; `--setup
+homography` is BARF's own set-up, `--compare` puts all pose fields side by side.
 """
 
 import time
@@ -18,9 +18,9 @@ from jaxtyping import Float
 from jaxpose.experiments.checks import own_folder
 from jaxpose.experiments.command import MODULE, Command, execute
 from jaxpose.experiments.outcome import Outcome, cost
-from jaxpose.experiments.planar import alignment
+from jaxpose.experiments.planar import alignment, pyramid
 from jaxpose.experiments.planar import task as planar_task
-from jaxpose.experiments.planar.alignment import CHUNK, Aligned, Aligner
+from jaxpose.experiments.planar.alignment import CHUNK, Align, Aligned
 from jaxpose.experiments.planar.options import GROUPS, Config, resume_fingerprint, settled
 from jaxpose.experiments.planar.report import SUCCESS_PX, protocol, report, summary, table
 from jaxpose.experiments.planar.task import Photo, Task
@@ -105,28 +105,34 @@ def main(args: Sequence[str] | None = None, prog: str = MODULE + "planar") -> No
 def _field(config: Config, photo: Photo, folder: Path, on_update: OnUpdate) -> dict[str, Any]:
     """All motions with one pose field, written."""
     started = time.perf_counter()
-    assert config.image is not None and config.pose is not None and config.steps is not None
+    assert config.image is not None and config.pose is not None
     _prepare(folder, config)
     net, network = (_SMOKE_NET, _SMOKE_IMAGE) if config.smoke else (PoseNetConfig(), ImageConfig())
     patches, homographies = planar_task.PATCHES[config.setup], config.setup == "homography"
     warps = homography_warps(patches) if homographies else motion_warps(config.pose, patches, net)
     on_update(Update(f"compiling {config.pose}"))
-    compiled = alignment.aligner(photo, image(network), warps, steps=config.steps, points=config.points)
+    if config.preset == "paper":
+        assert config.steps is not None and config.points is not None
+        scene = image(network)
+        align = alignment.by_adam(photo, scene, warps, steps=config.steps, points=config.points)
+    else:
+        align = pyramid.by_gauss_newton(photo, warps)
     for motion in range(config.motions):
         if not _file(folder, motion).exists():
-            _motion(config, photo, folder, compiled, motion, on_update)
+            _motion(config, photo, folder, align, motion, on_update)
     motions = _finished(folder, config.motions)
     title = f"{config.image.name}, {config.setup} set-up, seed {config.seed}"
     curves = _curves(motions)
-    steps = CHUNK * np.arange(curves.shape[1], dtype=float)
+    steps = (CHUNK if config.preset == "paper" else 1) * np.arange(curves.shape[1], dtype=float)
     planar_plots.corner_errors(folder / "corner_errors.png", steps, {config.pose: curves}, SUCCESS_PX, title)
     results = {
         "experiment": "planar",
         "setup": config.setup,
+        "preset": config.preset,
         "pose": config.pose,
         "seed": config.seed,
         "smoke": config.smoke,
-        "protocol": protocol(config.setup, photo, config.image, config.steps, config.points, warps),
+        "protocol": protocol(config, photo, warps),
         **summary(motions),
         **cost(started),
     }
@@ -138,24 +144,23 @@ def _motion(
     config: Config,
     photo: Photo,
     folder: Path,
-    compiled: Aligner,
+    align: Align,
     motion: int,
     on_update: OnUpdate,
 ) -> None:
     """Align one motion and keep what came of it."""
     began = time.perf_counter()
-    pose, steps = config.pose, config.steps
-    assert pose is not None and steps is not None
+    pose, steps = config.pose, config.steps or pyramid.count(photo.crop)
     task = planar_task.draw(config.setup, photo, config.seed, motion)
 
-    def on_chunk(step: int, loss: float, corner_px: float) -> None:
+    def on_step(step: int, loss: float, corner_px: float) -> None:
         state = {"loss": f"{loss:.5f}", "corners": f"{corner_px:.2f} px"}
         on_update(Update(f"{pose} {motion + 1}/{config.motions}", step, steps, state=state))
 
     key = jax.random.fold_in(jax.random.key(config.seed), motion)
-    aligned = alignment.align(compiled, photo, task, key, steps, on_chunk)
+    aligned = align(task, key, on_step)
     numbers = {"motion": motion, "seconds": time.perf_counter() - began, **_measured(photo, task, aligned)}
-    _draw(folder / f"motion_{motion:02d}.png", config, photo, task, compiled, aligned, numbers)
+    _draw(folder / f"motion_{motion:02d}.png", config, photo, task, aligned, numbers)
     atomic.write_json(_file(folder, motion), numbers)  # last: with it the motion counts as finished
 
 
@@ -191,11 +196,10 @@ def _draw(
     config: Config,
     photo: Photo,
     task: Task,
-    compiled: Aligner,
     aligned: Aligned,
     numbers: dict[str, Any],
 ) -> None:
-    """The neural image of one motion beside the photograph."""
+    """The image that was found with one motion, beside the photograph."""
     height, width = photo.rgb.shape[:2]
     start = np.eye(3)[None]
     outlines = {
@@ -207,13 +211,13 @@ def _draw(
         )
     }
     before, after = numbers["start_corner_error_px"], numbers["corner_error_px"]
+    steps = config.steps or pyramid.count(photo.crop)
     title = (
         f"{config.pose}, motion {numbers['motion']}: corner error {before:.1f} px at the start, "
-        f"{after:.3f} px after {config.steps} steps, PSNR {numbers['psnr']:.1f} dB"
+        f"{after:.3g} px after {steps} steps, PSNR {numbers['psnr']:.1f} dB"
     )
-    neural = alignment.picture(compiled, photo, aligned)
     seen = planar_task.covered(photo, task.H_image_patch)
-    planar_plots.reconstruction(path, photo.rgb, neural, seen, outlines, title)
+    planar_plots.reconstruction(path, photo.rgb, aligned.picture, seen, outlines, title)
 
 
 def _file(folder: Path, motion: int) -> Path:

@@ -6,6 +6,8 @@ from typing import Any
 import numpy as np
 
 from jaxpose.experiments.outcome import SMOKE, cost_text, markdown_table, number
+from jaxpose.experiments.planar import pyramid
+from jaxpose.experiments.planar.options import Config
 from jaxpose.experiments.planar.task import PATCHES, PROTOCOL, Photo
 from jaxpose.experiments.planar.warps import RESET_EVERY, SPLINE_KNOTS, Warps
 
@@ -21,11 +23,11 @@ _COLUMNS: tuple[str, ...] = (
 )
 
 
-def protocol(setup: str, photo: Photo, path: Path, steps: int, points: int, warps: Warps) -> dict[str, Any]:
+def protocol(config: Config, photo: Photo, warps: Warps) -> dict[str, Any]:
     """How the numbers of a run came about, in words and numbers."""
+    assert config.image is not None
+    path, setup = config.image, config.setup
     height, width = photo.rgb.shape[:2]
-    rates = warps.rates if isinstance(warps.rates, dict) else {"pose": warps.rates}
-    reset = f"every {RESET_EVERY} steps to the least-squares natural cubic spline with {SPLINE_KNOTS} knots"
     return {
         "image": path.name,
         "size": (width, height),
@@ -39,11 +41,28 @@ def protocol(setup: str, photo: Photo, path: Path, steps: int, points: int, warp
         "all patches but patch 0, whose error is zero by construction; no alignment afterwards",
         "success": f"corner error below {SUCCESS_PX:g} px",
         "psnr": "of all pixels of all patches, patch 0 included",
-        "steps": steps,
-        "points_per_patch_and_step": points,
+        **(_adam(config, warps) if config.preset == "paper" else _gauss_newton(photo)),
+    }
+
+
+def _adam(config: Config, warps: Warps) -> dict[str, Any]:
+    rates = warps.rates if isinstance(warps.rates, dict) else {"pose": warps.rates}
+    reset = f"every {RESET_EVERY} steps to the least-squares natural cubic spline with {SPLINE_KNOTS} knots"
+    return {
+        "image_found": "neural",
+        "steps": config.steps,
+        "points_per_patch_and_step": config.points,
         "rates": rates | {"image": 1e-3},
         "pose_rates_decay_to": warps.decay,
         "reset": "none" if warps.reset is None else reset,
+    }
+
+
+def _gauss_newton(photo: Photo) -> dict[str, Any]:
+    return {
+        "image_found": "pixels, bilinear between them as the patches were cut",
+        "steps": pyramid.count(photo.crop),
+        "blurs_px": pyramid.blurs(photo.crop),
     }
 
 
@@ -90,7 +109,8 @@ def report(folder: Path, results: dict[str, Any]) -> str:
     patches = f"{about['patches']} patches of {about['patch_px']} px"
     return "\n".join([
         f"planar: {about['image']} {width}x{height}, {one['setup']} set-up, {patches}, "
-        f"{len(one['motions'])} motions, {about['steps']} steps, seed {results['seed']}{smoke}",
+        f"{len(one['motions'])} motions, preset {one['preset']}, {about['steps']} steps, "
+        f"seed {results['seed']}{smoke}",
         "",
         table(by_field),
         "",

@@ -47,6 +47,13 @@ class Photo(NamedTuple):
         """Pixels of one unit of length."""
         return max(self.rgb.shape[:2]) / 2
 
+    @property
+    def pixels(self) -> Float[np.ndarray, "hw 2"]:
+        """Centres of all pixels, row by row."""
+        height, width = self.rgb.shape[:2]
+        x, y = np.arange(width) + 0.5 - width / 2, np.arange(height) + 0.5 - height / 2
+        return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2) / self.unit
+
 
 class Task(NamedTuple):
     """Patches to align, and the ground truth; patch 0 is the centre crop itself."""
@@ -139,9 +146,7 @@ def homography(h: Float[np.ndarray, "n 8"]) -> Float[np.ndarray, "n 3 3"]:
 def covered(photo: Photo, H_image_patch: Float[np.ndarray, "n 3 3"]) -> Bool[np.ndarray, "h w"]:
     """Which pixels of the image at least one patch has seen."""
     height, width = photo.rgb.shape[:2]
-    x, y = np.arange(width) + 0.5 - width / 2, np.arange(height) + 0.5 - height / 2
-    image = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2) / photo.unit
-    within = np.abs(apply(np.linalg.inv(H_image_patch), image)) <= photo.crop / 2 / photo.unit
+    within = np.abs(apply(np.linalg.inv(H_image_patch), photo.pixels)) <= photo.crop / 2 / photo.unit
     return within.all(axis=-1).any(axis=0).reshape(height, width)
 
 

@@ -77,6 +77,11 @@ def planar(T: Float[Array, "*n 4 4"]) -> Float[Array, "*n 3 3"]:
     return _rigid(cosine / length, sine / length, T[..., 0, 3], T[..., 1, 3])
 
 
+def coordinates(H: Float[Array, "*n 3 3"]) -> Float[Array, "*n 3"]:
+    """x, y and the angle [rad] of rigid motions of the plane: what `task.rigid` takes."""
+    return jnp.stack([H[..., 0, 2], H[..., 1, 2], jnp.atan2(H[..., 1, 0], H[..., 0, 0])], axis=-1)
+
+
 def homography(h: Float[Array, "*n 8"]) -> Float[Array, "*n 3 3"]:
     """The matrix exponential of BARF's basis of sl(3), by its series: for entries below 1."""
     h1, h2, h3, h4, h5, h6, h7, h8 = (h[..., k] for k in range(8))
