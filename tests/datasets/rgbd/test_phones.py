@@ -1,5 +1,6 @@
 """Recordings of phones in the layouts of their apps, written here, read back."""
 
+import struct
 import zipfile
 
 import numpy as np
@@ -218,3 +219,13 @@ def test_polycam(tmp_path, walk, save):
     sheet.write_text(sheet.read_text().replace('"fx"', '"f"'))
     with pytest.raises(DataError, match=f"{sheet.name}: fx: expected a finite number above 0, got no such"):
         polycam.load(folder)
+
+
+@pytest.mark.parametrize("size", [0, 50, 5_000, 300_000])
+def test_lzfse_says_how_large_it_is_before_it_is_unpacked(size):
+    """Every kind of block, by the package's own writer: stored, LZVN, and LZFSE of several blocks."""
+    data = np.random.default_rng(0).integers(0, 9, size).astype(np.uint8).tobytes()
+    packed = phones.lzfse.compress(data)
+    assert record3d._unpacked_size(packed) == size
+    with pytest.raises((ValueError, struct.error)):
+        record3d._unpacked_size(packed[:-6])

@@ -2,6 +2,7 @@
 
 import io
 import re
+import struct
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -169,6 +170,8 @@ def _plane(source: _Source, name: str, kind: np.dtype, shape: tuple[int, int]) -
         except ImportError:
             raise DataError(f"{source.path}: compressed depth needs the package lzfse: {EXTRA}") from None
         try:
+            if (there := _unpacked_size(data)) != size:  # the package allots whatever a damaged one fills
+                raise ValueError(f"{there} bytes, not {size}")
             data = lzfse.decompress(data)
         except Exception as error:
             raise DataError(f"{source.path}: {name}: expected LZFSE, got {error}") from None
@@ -176,6 +179,24 @@ def _plane(source: _Source, name: str, kind: np.dtype, shape: tuple[int, int]) -
         wanted = f"{shape[1]}x{shape[0]} of {kind.name}, {size} bytes"
         raise DataError(f"{source.path}: {name}: expected {wanted}, got {len(data)}")
     return np.frombuffer(data, kind).reshape(shape)
+
+
+def _unpacked_size(data: bytes) -> int:
+    """How many bytes the blocks of LZFSE say that they hold, by their headers (Apple's lzfse_internal.h)."""
+    at, raw = 0, 0
+    while (kind := data[at : at + 4]) != b"bvx$":
+        (count,) = struct.unpack_from("<I", data, at + 4)
+        if kind == b"bvx-":
+            length = 8 + count
+        elif kind == b"bvxn":
+            length = 12 + struct.unpack_from("<I", data, at + 8)[0]
+        elif kind == b"bvx2":
+            literals, matches, header = struct.unpack_from("<3Q", data, at + 8)
+            length = (header & 0xFFFFFFFF) + (literals >> 20 & 0xFFFFF) + (matches >> 40 & 0xFFFFF)
+        else:
+            raise ValueError(f"a block of kind {kind!r}")
+        at, raw = at + max(length, 8), raw + count
+    return raw
 
 
 def _intrinsics(source: _Source, frames: list[int], size: tuple[int, int]) -> tuple[Pinhole, tuple[str, ...]]:
