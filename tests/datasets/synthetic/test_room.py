@@ -317,6 +317,7 @@ def test_every_paint_depends_on_its_generator():
         {"speed": float("inf")},
         {"depth_noise": -0.1},
         {"sensor": "sonar"},
+        {"scene": "attic"},
         {"seed": -1},
         {"duration_s": 0.1},
     ],

@@ -8,13 +8,15 @@ import numpy as np
 from jaxtyping import Array, Float, Int, UInt
 
 from jaxpose.datasets.synthetic import textures
-from jaxpose.datasets.synthetic.furniture import LIGHTS, Piece
+from jaxpose.datasets.synthetic.furniture import Piece
 from jaxpose.datasets.synthetic.shapes import FACES, Hit, Shapes, Solids, cast
 
 TEXEL = 0.005  # [m]
 LEVELS = 4  # each of half the resolution
 LATTICE = 0.06  # spacing of the points where light is computed [m]
 _SKY = 32  # directions from which the glow is gathered
+_SPOTS = np.array([(i, j, 0.0) for i in (-0.2, 0.0, 0.2) for j in (-0.2, 0.0, 0.2)])  # [m] of a lamp
+_LAMPS = (3.4, 3.2, 2.9), (3.5, 3.1, 2.6)  # red, green, blue of lamps in turn
 
 
 class Atlas(NamedTuple):
@@ -73,12 +75,10 @@ def unfold(piece: Piece, face: int, u: np.ndarray, v: np.ndarray) -> tuple[np.nd
 
 @jax.jit
 def illuminate(
-    shapes: Shapes, point: Float[Array, "3 n"], normal: Float[Array, "3 n"]
+    shapes: Shapes, spots: Float[Array, "s 3"], point: Float[Array, "3 n"], normal: Float[Array, "3 n"]
 ) -> Float[Array, "n 3"]:
-    """Light (red, green, blue) on surface points: two lamps with soft shadows, and a glow from all around."""
-    start = point + 1e-3 * normal
-    offsets = np.array([(i, j, 0.0) for i in (-0.2, 0.0, 0.2) for j in (-0.2, 0.0, 0.2)])
-    spots = jnp.asarray((np.asarray(LIGHTS)[:, None] + offsets).reshape(-1, 3), point.dtype)
+    """Light (red, green, blue) on surface points: lamps, of `_SPOTS` each, and a glow from all around."""
+    start, lights = point + 1e-3 * normal, len(spots) // len(_SPOTS)
     # the normal plus points on a sphere: directions spread by Lambert's law
     directions = [
         spots[:, :, None] - start[None],
@@ -92,10 +92,11 @@ def illuminate(
     facing = jnp.maximum(jnp.sum(lamp * normal[None], axis=1), 0) * jnp.maximum(
         lamp[:, 2], 0
     )  # they shine down
-    lamps = jnp.where(shine, facing / (square * (square + 1.5)), 0).reshape(len(LIGHTS), -1, point.shape[1])
+    lamps = jnp.where(shine, facing / (square * (square + 1.5)), 0).reshape(lights, -1, point.shape[1])
     reach = distance[len(spots) :] * jnp.linalg.norm(directions[len(spots) :], axis=1)
     glow = jnp.mean(1 - jnp.exp(-reach / 0.4), axis=0, keepdims=True)
-    colour = jnp.array([(3.4, 3.2, 2.9), (3.5, 3.1, 2.6), (0.62, 0.65, 0.7)], point.dtype)
+    shades = [_LAMPS[k % 2] for k in range(lights)]
+    colour = jnp.array([*shades, (0.62, 0.65, 0.7)], point.dtype)
     return jnp.matmul(jnp.concatenate([lamps.mean(axis=1), glow]).T, colour, precision="highest")
 
 
@@ -107,7 +108,12 @@ def _sphere(count: int) -> np.ndarray:
     )
 
 
-def bake(pieces: list[Piece], shapes: Shapes, rng: np.random.Generator) -> Atlas:
+def bake(
+    pieces: list[Piece],
+    shapes: Shapes,
+    rng: np.random.Generator,
+    lights: tuple[tuple[float, float, float], ...],
+) -> Atlas:
     """Paint every face and light it; `pieces` and `shapes` as `gather` returns them."""
     faces = [(piece, face) for piece in pieces for face in range(FACES)]
     size = [np.ceil(np.divide(extent(*item), TEXEL)).astype(int) for item in faces]
@@ -119,7 +125,8 @@ def bake(pieces: list[Piece], shapes: Shapes, rng: np.random.Generator) -> Atlas
         )
         unfolded.append(unfold(*item, u.ravel(), v.ravel()))
     point, normal = (jnp.asarray(np.concatenate(p).T, jnp.float32) for p in zip(*unfolded, strict=True))
-    light = np.asarray(illuminate(shapes, point, normal)) ** np.float32(1 / 2.2)
+    spots = jnp.asarray((np.asarray(lights)[:, None] + _SPOTS).reshape(-1, 3), jnp.float32)
+    light = np.asarray(illuminate(shapes, spots, point, normal)) ** np.float32(1 / 2.2)
 
     charts, used = [], 0
     for (piece, face), (width, height), (columns, rows) in zip(faces, size, lattice, strict=True):

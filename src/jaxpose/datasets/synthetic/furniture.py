@@ -216,9 +216,9 @@ def prints() -> list[Piece]:
     ]
 
 
-def shell(tint, size: Extent) -> Piece:
+def shell(tint, size: Extent, lights: tuple[tuple[float, float, float], ...] = LIGHTS) -> Piece:
     """The room: walls of four kinds, floor boards, ceiling panels with the lamps."""
-    glowing = tuple((x + size[0] / 2, y + size[1] / 2) for x, y, _ in LIGHTS)
+    glowing = tuple((x + size[0] / 2, y + size[1] / 2) for x, y, _ in lights)
     painters = (
         partial(textures.plaster, colour=tint(0.8, 0.75, 0.64)),
         partial(textures.wallpaper, colour=tint(0.55, 0.66, 0.62)),

@@ -19,7 +19,7 @@ _LOOK = (  # rad: yaw, pitch, roll
     ((0.05, 0.14), (0.012, 0.9), (0.003, 3.1)),
 )
 _RADII = (1.2, 0.8)  # of the loop [m]
-_HEIGHT = 1.38  # [m]
+HEIGHT = 1.38  # [m]
 _PITCH = 0.23  # downwards [rad]
 
 
@@ -40,6 +40,15 @@ def draw(rng: np.random.Generator, speed: float) -> HandHeldMotion:
 
 def pose(walk: HandHeldMotion, t: Float[Array, ""]) -> Float[Array, "4 4"]:
     """`T_world_body` at `t` [s]; body axes are forwards, left, up."""
+    around = jnp.asarray(walk.start, t.dtype) + 2 * jnp.pi / LOOP_S * jnp.asarray(walk.speed, t.dtype) * t
+    loop = jnp.stack([_RADII[0] * jnp.cos(around), _RADII[1] * jnp.sin(around), jnp.full_like(t, HEIGHT)])
+    return by_hand(walk, t, loop, around + jnp.pi)  # across the room, past its middle
+
+
+def by_hand(
+    walk: HandHeldMotion, t: Float[Array, ""], place: Float[Array, "3"], heading: Float[Array, ""]
+) -> Float[Array, "4 4"]:
+    """`T_world_body` at `t` [s] of a hand at a `place` [m] of its course, looking along a `heading` [rad]."""
     walk = HandHeldMotion(*(jnp.asarray(x, t.dtype) for x in walk))
     phase = t * jnp.abs(walk.speed)
 
@@ -47,13 +56,8 @@ def pose(walk: HandHeldMotion, t: Float[Array, ""]) -> Float[Array, "4 4"]:
         amplitude, frequency = jnp.moveaxis(jnp.asarray(kind, t.dtype), -1, 0)
         return jnp.sum(amplitude * jnp.sin(2 * jnp.pi * frequency * phase + phases), axis=-1)
 
-    around = walk.start + 2 * jnp.pi / LOOP_S * walk.speed * t
-    loop = jnp.stack([_RADII[0] * jnp.cos(around), _RADII[1] * jnp.sin(around), jnp.full_like(t, _HEIGHT)])
-    # across the room, past its middle
-    angles = waves(_LOOK, walk.look) + jnp.stack(
-        [around + jnp.pi, jnp.full_like(t, _PITCH), jnp.zeros_like(t)]
-    )
-    return se3.make(_yaw_pitch_roll(angles), loop + waves(_SWAY, walk.sway))
+    angles = waves(_LOOK, walk.look) + jnp.stack([heading, jnp.full_like(t, _PITCH), jnp.zeros_like(t)])
+    return se3.make(_yaw_pitch_roll(angles), place + waves(_SWAY, walk.sway))
 
 
 def _yaw_pitch_roll(angles: Float[Array, "3"]) -> Float[Array, "3 3"]:

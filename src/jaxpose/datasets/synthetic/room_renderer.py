@@ -6,16 +6,17 @@ Colour, depth, ground truth and IMU along one analytic path.
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt8
 
-from jaxpose.datasets.synthetic import hand_held
+from jaxpose.datasets.synthetic import floor, hand_held
 from jaxpose.datasets.synthetic.atlas import Atlas, bake, gather, look_up
 from jaxpose.datasets.synthetic.depth_sensors import RANGES, Sensor, measured_depth
-from jaxpose.datasets.synthetic.furniture import Extent, furnish
+from jaxpose.datasets.synthetic.furniture import LIGHTS, Extent, furnish
 from jaxpose.datasets.synthetic.shapes import Shapes, cast, locate, within_cone
 from jaxpose.datasets.synthetic.trajectory import Motion, by_hand, recorded
 from jaxpose.datasets.types import Frame, Recording
@@ -29,6 +30,8 @@ _MOST_SAMPLES = 1e8  # of a sensor over the walk
 class RoomConfig:
     """Settings of `room`; every random choice follows from `seed`."""
 
+    # One room, or a floor of four rooms and a corridor: once around it is 36 m, 72 s at speed 1.
+    scene: Literal["room", "floor"] = "room"
     duration_s: float = 12.0  # [s] of the walk
     rate_hz: float = 5.0  # [Hz] of the frames
     imu_rate_hz: float = 200.0  # [Hz] of the IMU
@@ -40,9 +43,6 @@ class RoomConfig:
     # steps, two cameras, the phase of light, or points of a coarser camera that are carried over to colour.
     sensor: Sensor = "axial"
     depth_noise: float = 1.0  # times the sensor's random noise; 0 with axial is exact depth
-    line_delay_us: float = (
-        0.0  # [us] of a rolling shutter, from row to row; a frame's time is its first row's
-    )
     holes: bool = True  # no depth on what defeats the sensor: shadows, grazing, dark or plain surfaces
     line_delay_us: float = 0.0  # [us] from row to row of a rolling shutter; a frame's time is its first row's
     imu_noise: ImuNoise = ADIS16448
@@ -59,6 +59,8 @@ class RoomConfig:
                 raise ValueError(f"RoomConfig.{name}: expected zero or more, got {getattr(self, name)}")
         if self.line_delay_us > 1000:
             raise ValueError(f"RoomConfig.line_delay_us: expected at most 1000 us, got {self.line_delay_us}")
+        if self.scene not in ("room", "floor"):
+            raise ValueError(f"RoomConfig.scene: expected one of room, floor, got {self.scene}")
         if self.sensor not in RANGES:
             raise ValueError(f"RoomConfig.sensor: expected one of {', '.join(RANGES)}, got {self.sensor}")
         for rate in ("rate_hz", "imu_rate_hz"):
@@ -83,7 +85,7 @@ def room(config: RoomConfig = RoomConfig()) -> Recording:
         The recording, with ground truth and IMU.
     """
     drive = _drive(config)
-    shapes, atlas = scenery(config.seed, drive.room)
+    shapes, atlas = scenery(config.seed, drive.room, config.scene)
     focal = 585 / 640 * config.width  # Kinect's angle of view
     centre = (config.width - 1) / 2, (config.height - 1) / 2
     camera = Camera(focal, focal, *centre, config.width, config.height)
@@ -113,11 +115,12 @@ def room(config: RoomConfig = RoomConfig()) -> Recording:
 
 
 @lru_cache(maxsize=2)
-def scenery(seed: int, size: Extent) -> tuple[Shapes, Atlas]:
-    """What stands in a room of this size, with paint and light: seconds of work, the same for every walk."""
+def scenery(seed: int, size: Extent, scene: str = "room") -> tuple[Shapes, Atlas]:
+    """What stands in a room of this size, or on the floor, with paint and light: seconds of work."""
     palette, brush, _ = np.random.default_rng(seed).spawn(3)
-    pieces, shapes = gather(furnish(palette, size))
-    return shapes, bake(pieces, shapes, brush)
+    pieces = floor.furnish(palette) if scene == "floor" else furnish(palette, size)
+    ordered, shapes = gather(pieces)
+    return shapes, bake(ordered, shapes, brush, floor.LIGHTS if scene == "floor" else LIGHTS)
 
 
 def _drive(config: RoomConfig) -> Motion:
@@ -126,7 +129,9 @@ def _drive(config: RoomConfig) -> Motion:
     t = np.arange(int(np.floor(config.duration_s * config.rate_hz + 1e-9)) + 1) / config.rate_hz
     *_, path = np.random.default_rng(config.seed).spawn(3)
     walk = hand_held.draw(path, config.speed)
-    return by_hand(walk, t, config.imu_rate_hz, config.imu_noise, config.gravity_world, seed=config.seed)
+    course = floor.tour if config.scene == "floor" else hand_held.pose
+    noise, gravity = config.imu_noise, config.gravity_world
+    return by_hand(walk, t, config.imu_rate_hz, noise, gravity, course, seed=config.seed)
 
 
 @partial(jax.jit, static_argnums=0)

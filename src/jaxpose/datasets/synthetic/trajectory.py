@@ -8,7 +8,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from jaxpose.datasets.ground_truth import poses_at
 from jaxpose.datasets.rgbd import euroc
@@ -30,6 +30,9 @@ _EUROC_LEVER_ARM = (-0.0216, -0.0647, 0.0098)
 _AROUND, _ABOVE = 1.5, 1.2  # [m] free beside and over a recorded motion
 
 
+Course = Callable[[hand_held.HandHeldMotion, Float[Array, ""]], Float[Array, "4 4"]]  # T_world_body at t [s]
+
+
 class Motion(NamedTuple):
     """A motion and its readings; the room is of a size that holds it."""
 
@@ -49,33 +52,34 @@ def by_hand(
     imu_rate_hz: float,
     noise: ImuNoise,
     gravity_world: tuple[float, float, float] = GRAVITY_WORLD,
+    course: Course = hand_held.pose,
     *,
     seed: int,
 ) -> Motion:
-    """A walk around the room's middle, and its exact derivatives as readings up to the last frame."""
+    """A walk along a course, and its exact derivatives as readings up to the last frame."""
     samples = int(np.ceil(t[-1] * imu_rate_hz - 1e-9)) + 1
     with jax.enable_x64(True):
         times = jnp.asarray(t), jnp.asarray(np.arange(samples) / imu_rate_hz)
-        T_world_body, imu = _readings(walk, *times, jax.random.key(seed), noise, gravity_world)
+        T_world_body, imu = _readings(walk, *times, jax.random.key(seed), noise, gravity_world, course)
         T_world_body, imu = np.asarray(T_world_body), Imu(*(np.array(x) for x in imu))
     # From right, down, forwards to forwards, left, up, not quite.
     turn = rigid.so3_exp(np.array(_MOUNTING)) @ [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
 
     def pose(times):
         with jax.enable_x64(True):
-            return np.asarray(_poses(walk, jnp.asarray(times)))
+            return np.asarray(_poses(walk, jnp.asarray(times), course))
 
     return Motion("room", t, T_world_body, imu, rigid.make(turn, np.array(_LEVER_ARM)), SIZE, pose)
 
 
-@jax.jit
-def _poses(walk, times):
-    return jax.vmap(partial(hand_held.pose, walk))(times)
+@partial(jax.jit, static_argnames="course")
+def _poses(walk, times, course):
+    return jax.vmap(partial(course, walk))(times)
 
 
-@partial(jax.jit, static_argnames=("noise", "gravity_world"))
-def _readings(walk, frame_times, imu_times, key, noise, gravity_world):
-    pose = partial(hand_held.pose, walk)
+@partial(jax.jit, static_argnames=("noise", "gravity_world", "course"))
+def _readings(walk, frame_times, imu_times, key, noise, gravity_world, course):
+    pose = partial(course, walk)
     imu = simulate(pose, imu_times, noise=noise, key=key, gravity_world=gravity_world)
     return jax.vmap(pose)(frame_times), imu
 
