@@ -59,7 +59,7 @@ RANGES = {
     "translation_scale": _POSITIVE,
     "colour_weight": Range(0, 1e6),
     "dof_weight": Range(0, 1e6),
-    "recovery": _RELATIVE,  # all within it
+    **dict.fromkeys(("recovery", "loop"), _RELATIVE),  # all within them
     "room.duration_s": Range(0, 1e6, True),
     "room.speed": Range(0, 100, True),
     "room.depth_noise": Range(0, 1e3),

@@ -3,11 +3,13 @@ from . import config as config
 from . import map as map
 from . import tracking as tracking
 from .config import ImuMode as ImuMode
+from .config import LoopConfig as LoopConfig
 from .config import MapConfig as MapConfig
 from .config import RecoveryConfig as RecoveryConfig
 from .config import SlamConfig as SlamConfig
 from .config import TrackConfig as TrackConfig
 from .line_delay import estimate_line_delay as estimate_line_delay
+from .loops.types import Loops as Loops
 from .pipeline import Progress as Progress
 from .pipeline import SlamResult as SlamResult
 from .pipeline import finish as finish

@@ -53,23 +53,6 @@ def final_trajectory(state: SlamState, imu: Imu | None) -> FinalTrajectory:
     return FinalTrajectory(T_world_cam, *posterior.field(), moved_rms, turned_rms, posterior)
 
 
-def all_readings(came: tuple[Imu, ...]) -> Imu | None:
-    """Readings that came in parts as one; of what was read before again, the first counts.
-
-    Args:
-        came: parts, in order.
-
-    Returns:
-        All of them; None without any.
-    """
-    if not came:
-        return None
-    t = np.concatenate([part.t for part in came])
-    new = t > np.concatenate([[-np.inf], np.maximum.accumulate(t)[:-1]])
-    omega, force = (np.concatenate([part[k] for part in came])[new] for k in (1, 2))
-    return Imu(t[new], omega, force)
-
-
 def estimate_trajectory(state: SlamState, imu: Imu | None) -> Posterior | None:
     """The trajectory that poses and readings together make most likely, on the clock of the first frame.
 

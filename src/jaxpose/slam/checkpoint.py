@@ -17,11 +17,13 @@ from jaxpose.imu import Imu
 from jaxpose.scenes import GridConfig
 from jaxpose.scenes.voxel_blocks import BlockConfig, packed, unpacked
 from jaxpose.slam.config import SlamConfig
+from jaxpose.slam.loops.types import no_loops
 from jaxpose.slam.map.backend import map_backend
 from jaxpose.slam.pipeline import begin
 from jaxpose.slam.tracking.features import detect
 from jaxpose.slam.types import SlamState, TrackingStatus, no_frames
 
+_NUMBERS = "max_depth", "duration_s", "settled"  # stored as arrays
 _FASTEST = 1e6  # [m/s, rad/s, m]
 
 
@@ -43,12 +45,15 @@ def load(path: Path | str, recording: Recording, config: SlamConfig) -> SlamStat
         count = {name: len(file[f"['state'].{name}"]) for name in ("frames.t", "thumbnails")}
         readings = len(file["['state'].imu.t"]) if "['state'].imu.t" in file else None
         blocks = len(file["['state'].map.params[0]"])
+        loops = len(file["['state'].loops.a"])
         size: dict[str, Any] = {k: tuple(x) if isinstance(x, list) else x for k, x in size.items()}
         grid = kind(**size)
     state = begin(recording, config)._replace(
         frames=no_frames(np.zeros(count["frames.t"])),
         thumbnails=np.zeros((count["thumbnails"], 2, 12, 16)),
+        keyframe_depths=np.zeros((count["thumbnails"], 12, 16)),
         imu=None if readings is None else Imu(*(np.zeros((readings, *shape)) for shape in ((), (3,), (3,)))),
+        loops=no_loops(loops),
         grid=grid,
     )
     state = state._replace(map=map_backend(state).start())
@@ -69,6 +74,7 @@ def load(path: Path | str, recording: Recording, config: SlamConfig) -> SlamStat
         grid=grid,
         camera=recording.camera,
         max_depth=float(state.max_depth),
+        settled=int(state.settled),
         duration_s=float(state.duration_s),
     )
 
@@ -78,9 +84,13 @@ def _check(path: Path | str, state: SlamState) -> None:
     frames, motion = state.frames, state.motion
     rigid_transforms(path, "frames.T_world_body", frames.T_world_body)
     numbers(path, frames._asdict(), "status", (None,), whole=True, least=0, most=max(TrackingStatus))
+    rigid_transforms(path, "loops.T_a_b", state.loops.T_a_b)
+    for name in ("a", "b"):
+        numbers(path, state.loops._asdict(), name, (None,), whole=True, least=0, most=frames.count - 1)
     for name in ("twist", "velocity_body", "gyro_bias", "accelerometer_bias_world"):
         numbers(path, motion._asdict(), name, (None,), least=-_FASTEST, most=_FASTEST)
     numbers(path, state._asdict(), "max_depth", above=0, most=_FASTEST)
+    numbers(path, state._asdict(), "settled", whole=True, least=0, most=frames.count - 1)
     for leaf in jax.tree.leaves((state.params, state.exposure, state.thumbnails, state.map)):
         if jnp.issubdtype(leaf.dtype, jnp.floating) and not np.isfinite(leaf).all():
             raise DataError(f"{path}: expected a map and a network of finite numbers, got NaN or infinity")
@@ -92,7 +102,7 @@ def _as_arrays(state: SlamState, size: dict[str, Any], blocks: int | None = None
     Of a map of blocks it holds the rows in use; `blocks` makes a place for as many, to read them into.
     """
     assert state.map is not None
-    numbers = {name: np.asarray(getattr(state, name)) for name in ("max_depth", "duration_s")}
+    numbers = {name: np.asarray(getattr(state, name)) for name in _NUMBERS}
     motion = state.motion._replace(gyro_bias_sigma=np.asarray(state.motion.gyro_bias_sigma))
     state = state._replace(**numbers, motion=motion, camera=None, config=None, grid=None)
     state = state._replace(

@@ -134,6 +134,26 @@ class RecoveryConfig:
 
 
 @dataclass(frozen=True)
+class LoopConfig:
+    """When two keyframes are believed to show the same place.
+
+    Records of the pairs behind the numbers are in `experiments/README.md`.
+    """
+
+    drift: float = 1.0  # voxels that a surface may have drifted by, one sigma, for a loop to be looked for
+    share: float = 0.05  # of what a frame sees that an earlier one may have seen, to be compared with it
+    candidates: int = 3  # keyframes whose features are compared with a new one's
+    overlap: float = 0.25  # share of the depth of one image where the other has depth too
+    agreement: float = 0.75  # share of that which is on the other's surface
+    conflict: float = 0.1  # share of that which is where the other has seen free space
+    colour: float = 0.7  # correlation of grey values on the surface
+    sigma: float = 0.02  # [m, rad] of the relative pose along its worst axis
+
+    def __post_init__(self):
+        _check(self, "loop", positive=tuple(field.name for field in fields(self)))
+
+
+@dataclass(frozen=True)
 class SlamConfig:
     """Settings of a run; every random choice follows from `seed`."""
 
@@ -143,6 +163,8 @@ class SlamConfig:
     frame: FrameName = "anchored"
     # Sparse features as a second opinion on the motion (`gauss_newton` only): ORB by OpenCV, or none.
     features: Literal["orb", "none"] = "orb"
+    # Places that are seen again correct the trajectory and the map (with features and a fused map).
+    loops: bool = True
     # offset, extrinsics: by the final pass over a run with an IMU, beside biases and gravity; line-delay: by
     # three runs before it.
     estimate: tuple[Literal["offset", "extrinsics", "line-delay"], ...] = ()
@@ -153,6 +175,7 @@ class SlamConfig:
     track: TrackConfig = TrackConfig()
     map: MapConfig = MapConfig()
     recovery: RecoveryConfig = RecoveryConfig()
+    loop: LoopConfig = LoopConfig()
     map_every_s: float = 0.15  # [s] between mapping steps
     voxel: float | None = None  # [m] size of the map's cells; None: from the size of the room
     hold_out: int = 0  # every n-th frame is tracked but never mapped, to measure the map on; 0: none
@@ -183,6 +206,11 @@ class SlamConfig:
     def uses_features(self) -> bool:
         """Whether poses are predicted by sparse features; the paper's own way of tracking has none."""
         return self.features != "none" and self.track.method == "gauss_newton"
+
+    @property
+    def uses_loops(self) -> bool:
+        """Whether loops are looked for: by features, and corrected where a map can be integrated anew."""
+        return self.loops and self.uses_features and self.map.method == "fused"
 
     @property
     def uses_field(self) -> bool:

@@ -45,22 +45,55 @@ def thumbnail(frame: Frame) -> Float[np.ndarray, "2 12 16"]:
     return channels / np.maximum(channels.std((1, 2), keepdims=True), 1e-3)
 
 
+def coarse_depth(frame: Frame) -> Float[np.ndarray, "12 16"]:
+    """The farthest depth [m] in each part of a frame; 0 where nothing was measured."""
+    height, width = frame.depth.shape
+    row, column = height // 12, width // 16
+    return frame.depth[: 12 * row, : 16 * column].reshape(12, row, 16, column).max((1, 3))
+
+
+def seen_shares(
+    points_world: Float[np.ndarray, "n 3"],
+    T_world_cam: Float[np.ndarray, "k 4 4"],
+    depth: Float[np.ndarray, "k 12 16"],
+    camera: Camera,
+) -> Float[np.ndarray, " k"]:
+    """Share of world points that each of some cameras has seen, as nothing it measured there hides them.
+
+    Poses may be off: points count up to a quarter of the image beside it, and a tenth behind what was
+    measured (`coarse_depth`).
+    """
+    points_cam = rigid.apply(rigid.inverse(T_world_cam)[:, None], points_world)
+    u, v = np.moveaxis(project_numpy(camera, points_cam), -1, 0)
+    u, v = (u + 0.5) / camera.width, (v + 0.5) / camera.height
+    inside = (points_cam[..., 2] > 0) & (np.abs(u - 0.5) < 0.75) & (np.abs(v - 0.5) < 0.75)
+    row, column = (np.clip(n * np.where(inside, x, 0), 0, n - 1).astype(int) for n, x in ((12, v), (16, u)))
+    farthest = depth[np.arange(len(depth))[:, None], row, column]
+    return np.mean(inside & (points_cam[..., 2] < 1.1 * farthest), axis=1)
+
+
 def unlikeness(thumbnails: Float[np.ndarray, "k 2 12 16"], frame: Frame) -> Float[np.ndarray, " k"]:
     """How little each thumbnail is like a frame's: the mean squared difference."""
     return np.mean((thumbnails - thumbnail(frame)) ** 2, axis=(1, 2, 3))
 
 
 def overlap(
-    points_world: np.ndarray, T_world_cam: np.ndarray, camera: Camera, *, margin: int = 20
+    points_world: np.ndarray,
+    T_world_cam: np.ndarray,
+    camera: Camera,
+    farthest: float = np.inf,
+    *,
+    margin: int = 20,
 ) -> np.ndarray:
     """Share (k,) of world points (n, 3) that each of the cameras (k, 4, 4) sees (NICE-SLAM's test).
 
-    A point counts that is at least `margin` pixels inside the image.
+    A point counts that is at least `margin` pixels inside the image, and nearer than `farthest` [m]: what is
+    behind a wall of the next room is in a camera's view too.
     """
     points_cam = rigid.apply(rigid.inverse(T_world_cam)[:, None], points_world)
     u, v = np.moveaxis(project_numpy(camera, points_cam), -1, 0)
     inside = (u >= margin) & (u < camera.width - margin) & (v >= margin) & (v < camera.height - margin)
-    return np.mean(inside, axis=1)
+    return np.mean(inside & (points_cam[..., 2] < farthest), axis=1)
 
 
 def choose(shares: np.ndarray, count: int, generator: np.random.Generator) -> list[int]:

@@ -22,10 +22,12 @@ from jaxpose.geometry.camera import Camera, angle_of_view
 from jaxpose.imu import GRAVITY_WORLD, Gravity, Imu
 from jaxpose.scenes import SceneField
 from jaxpose.scenes.voxel_blocks import BlockConfig, Blocks, voxel_blocks
-from jaxpose.slam.batch import all_readings, final_trajectory
+from jaxpose.slam.batch import final_trajectory
 from jaxpose.slam.config import SlamConfig
 from jaxpose.slam.initial_pose import first_pose, upright_pose
-from jaxpose.slam.keyframes import FrameReader, keyframe_images, thumbnail
+from jaxpose.slam.keyframes import FrameReader, coarse_depth, keyframe_images, thumbnail
+from jaxpose.slam.loops.closure import with_loops
+from jaxpose.slam.loops.types import Loops, no_loops
 from jaxpose.slam.map.backend import (
     as_blocks,
     framed_field,
@@ -36,6 +38,7 @@ from jaxpose.slam.map.backend import (
 )
 from jaxpose.slam.map.texture import Texture, make_texture, textured
 from jaxpose.slam.observation import to_device
+from jaxpose.slam.readings import all_readings, joined, readings_until
 from jaxpose.slam.tracker import expected_motion, next_pose, unrolled
 from jaxpose.slam.tracking.features import detect
 from jaxpose.slam.tracking.intrinsic_frame import is_due, make_refit, window
@@ -43,7 +46,6 @@ from jaxpose.slam.tracking.predict import GYRO_BIAS_SIGMA
 from jaxpose.slam.types import Frames, Motion, SlamState, no_frames
 
 _DEFAULT = SlamConfig()
-_KEPT_S = 0.1  # of readings before the last frame, so that they can be interpolated there
 
 
 class Progress(NamedTuple):
@@ -59,7 +61,9 @@ class SlamResult(NamedTuple):
     """A tracked sequence: poses, the map, and one continuous trajectory."""
 
     T_world_cam: Float[np.ndarray, "n 4 4"]
+    T_world_cam_odometry: Float[np.ndarray, "n 4 4"]  # motions as tracked, put together without loops
     frames: Frames
+    loops: Loops
     scene: SceneField
     map_config: BlockConfig
     scene_params: tuple[Blocks, Texture]
@@ -120,8 +124,11 @@ def init(
         exposure=np.ones(3, np.float32),
         max_depth=0.0,
         thumbnails=np.zeros((0, 2, 12, 16)),
+        keyframe_depths=np.zeros((0, 12, 16)),
         features=None,
         keyframe_features=(),
+        loops=no_loops(),
+        settled=0,
         images=(),
         readings=(),
         grid=None,
@@ -217,7 +224,7 @@ def track_all(
     state = state or begin(recording, config)
     for i in range(state.frames.count, len(recording.t)):
         started, t = time.perf_counter(), float(recording.t[i])
-        readings = _readings_until(recording.imu, state.frames.t[-1] if i else -np.inf, t)
+        readings = readings_until(recording.imu, state.frames.t[-1] if i else -np.inf, t)
         try:
             frame = check_frame(recording.read(i), recording.camera)
         except ValueError as error:
@@ -264,7 +271,7 @@ def _advance(state: SlamState, frame: Frame, t: float, imu: Imu | None, read: Fr
     i, config = state.frames.count, state.config
     generator = np.random.default_rng([config.seed, i])
     track_key, map_key = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), i))
-    state = state._replace(frames=state.frames.appended(t), imu=_joined(state, imu))
+    state = state._replace(frames=state.frames.appended(t), imu=joined(state, imu))
     predicted = expected_motion(state) if i else None
     if predicted is not None:
         frame = unrolled(state, predicted, frame)
@@ -274,7 +281,7 @@ def _advance(state: SlamState, frame: Frame, t: float, imu: Imu | None, read: Fr
         state = _first_pose(state)
     else:
         state = next_pose(state, predicted, frame, image, features, generator, track_key)
-    state = state._replace(features=features)
+    state = state._replace(features=features, frames=state.frames.with_odometry())
     if config.frame == "intrinsic" and is_due(i):
         state = _update_intrinsic_frame(state)
     T_world_cam = state.frames.T_world_body[i] @ state.T_body_cam
@@ -289,9 +296,15 @@ def _advance(state: SlamState, frame: Frame, t: float, imu: Imu | None, read: Fr
     image = image._replace(exposure=state.exposure)
     state = map_frame(state, image, points, read, generator, map_key)
     if state.frames.keyframe[i]:
-        state = state._replace(thumbnails=np.concatenate([state.thumbnails, thumbnail(frame)[None]]))
+        added = lambda kept, new: np.concatenate([kept, new[None]])
+        state = state._replace(
+            thumbnails=added(state.thumbnails, thumbnail(frame)),
+            keyframe_depths=added(state.keyframe_depths, coarse_depth(frame)),
+        )
         if features is not None:
             state = state._replace(keyframe_features=(*state.keyframe_features, features))
+        if config.uses_loops:
+            state = with_loops(state, frame, read)
     return state
 
 
@@ -336,35 +349,14 @@ def _finish(state: SlamState, read: FrameReader, imu: Imu | None) -> SlamResult:
     keyframes = keyframe_images(read, np.flatnonzero(frames.keyframe), tracked)
     texture = make_texture(config, blocks, keyframes, state.camera)
     return SlamResult(
+        T_world_cam_odometry=frames.T_odometry @ state.T_body_cam,
         frames=frames,
+        loops=state.loops,
         scene=textured(voxel_blocks(config), config),
         map_config=config,
         scene_params=(blocks, jax.tree.map(jnp.asarray, texture)),
         **found._asdict(),
     )
-
-
-def _joined(state: SlamState, imu: Imu | None) -> Imu | None:
-    """The readings that the next interval needs: the new ones behind those around the last frame."""
-    if imu is None or not state.config.uses_gyroscope:
-        return state.imu
-    new = Imu(*(np.asarray(x, np.float64) for x in imu))
-    if state.imu is None:
-        return new
-    since = state.frames.t[-1] - _KEPT_S if state.frames.count else -np.inf
-    kept = state.imu.t > since
-    kept[-2:] = True  # however slow the sensor is
-    later = new.t > state.imu.t[-1]
-    return Imu(*(np.concatenate([old[kept], more[later]]) for old, more in zip(state.imu, new, strict=True)))
-
-
-def _readings_until(imu: Imu | None, before: float, t: float) -> Imu | None:
-    """A recording's readings since `before` [s], and one after `t`, as a sensor would give them by then."""
-    if imu is None:
-        return None
-    times = np.asarray(imu.t)
-    first, last = np.searchsorted(times, before, side="right"), np.searchsorted(times, t, side="left") + 1
-    return Imu(*(np.asarray(x)[first:last] for x in imu))
 
 
 def _kept_image(state: SlamState, index: int) -> Frame:

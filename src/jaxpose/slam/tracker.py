@@ -61,6 +61,11 @@ def next_pose(
     used = predicted
     tracked = _track(state, frames, predicted, image, generator, near_key)
     lost = _failed(state, tracked, reach, held)
+    if lost and seen is not None and not frames.doubted[-2]:  # features of another place, then
+        seen, held, predicted, used = None, False, by_motion, by_motion
+        reach = _reach(state, predicted, held)
+        tracked = _track(state, frames, predicted, image, generator, near_key)
+        lost = _failed(state, tracked, reach, held)
     if lost or (not held and _appearance_doubtful(state, tracked, predicted)):
         corrected, found = _relocalise(state, frame, image, predicted.T_ref_body[-1], reach, wide_key)
         sigma = np.minimum(predicted.sigma, FOUND_SIGMA)

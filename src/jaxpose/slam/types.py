@@ -15,6 +15,7 @@ from jaxpose.imu import Imu
 from jaxpose.scenes import GridConfig
 from jaxpose.scenes.voxel_blocks import BlockConfig
 from jaxpose.slam.config import SlamConfig
+from jaxpose.slam.loops.types import Loops
 from jaxpose.slam.map.photometric import MapState
 from jaxpose.slam.tracking.features import Features
 
@@ -39,12 +40,14 @@ class Frames(NamedTuple):
 
     t: Float[np.ndarray, " n"]  # [s] as given, increasing
     T_world_body: Float[np.ndarray, "n 4 4"]
+    T_odometry: Float[np.ndarray, "n 4 4"]  # T_world_body as tracked: motions put together, without loops
     T_inner: Float[np.ndarray, "n 4 4"]  # motion since the last frame, in the frame `intrinsic`
     status: Int8[np.ndarray, " n"]  # TrackingStatus
     feature_nis: Float[np.ndarray, " n"]  # squared Mahalanobis distance from the pose by features
     line_delay: Float[np.ndarray, "n 2"]  # correction [s] by the image, and its information
     mapped: Bool[np.ndarray, " n"]  # the map was made from it
     keyframe: Bool[np.ndarray, " n"]
+    exposure: Float[np.ndarray, "n 3"]  # what its colours were multiplied by where it was mapped
     iterations: Int[np.ndarray, " n"]
     loss: Float[np.ndarray, " n"]  # of the image, in sigmas
     depth_error: Float[np.ndarray, " n"]  # [m] median
@@ -93,6 +96,14 @@ class Frames(NamedTuple):
         correction = rigid.exp(share[:, None] * rigid.log(T_predicted_found))
         return self.put(lost, T_world_body=self.T_world_body[lost] @ correction)
 
+    def with_odometry(self) -> "Frames":
+        """The same with the motions to the current frame, and to those in doubt before it, put together."""
+        first, last = (self.last_found if self.count > 1 else 0), self.count - 1
+        if last == 0:
+            return self.put(0, T_odometry=self.T_world_body[0])
+        since = rigid.inverse(self.T_world_body[first]) @ self.T_world_body[first + 1 :]
+        return self.put(np.arange(first + 1, last + 1), T_odometry=self.T_odometry[first] @ since)
+
     def appended(self, t: float) -> "Frames":
         """One more frame at `t` [s], of which nothing is known yet."""
         row = no_frames(np.array([t]))
@@ -106,12 +117,14 @@ def no_frames(t: Float[np.ndarray, " n"]) -> Frames:
     return Frames(
         t=np.asarray(t, np.float64),
         T_world_body=np.full((count, 4, 4), np.nan),
+        T_odometry=np.full((count, 4, 4), np.nan),
         T_inner=np.full((count, 4, 4), np.nan),
         status=np.zeros(count, np.int8),
         feature_nis=unknown,
         line_delay=np.full((count, 2), np.nan),
         mapped=no,
         keyframe=no,
+        exposure=np.full((count, 3), np.nan),
         iterations=np.zeros(count, int),
         loss=unknown,
         depth_error=unknown,
@@ -152,8 +165,11 @@ class SlamState(NamedTuple):
     exposure: Float[np.ndarray | Array, "3"]  # of the last registered image (`observation.Image`)
     max_depth: float  # [m] how deep the map is
     thumbnails: Float[np.ndarray, "k 2 12 16"]  # of the keyframes (`keyframes.thumbnail`)
+    keyframe_depths: Float[np.ndarray, "k 12 16"]  # (`keyframes.coarse_depth`)
     features: Features | None  # of the last frame; None: not used, or before the first
     keyframe_features: tuple[Features, ...]
+    loops: Loops
+    settled: int  # frame at which poses and loops last agreed, by a correction or without; 0: never
     images: tuple[Frame, ...]  # of the keyframes, where no recording can give them again
     readings: tuple[Imu, ...]  # all of them, as they came, where no recording can give them again
     grid: BlockConfig | GridConfig | None  # how finely the map resolves space; None: before the first frame

@@ -95,8 +95,21 @@ def tracking_numbers(result: SlamResult) -> dict[str, Any]:
         "iterations_mean": float(result.frames.iterations[1:].mean()),
         "depth_error_median_m": trajectory_error.statistics(result.frames.depth_error).median,
         "keyframes": result.keyframes,
+        "loops": loop_numbers(result),
         "field_rmse_m": result.field_rmse_m,
         "field_rmse_deg": result.field_rmse_deg,
+    }
+
+
+def loop_numbers(result: SlamResult) -> dict[str, Any]:
+    """What loops there were, and how far they have moved the camera."""
+    moved = result.frames.T_world_body[:, :3, 3] - result.frames.T_odometry[:, :3, 3]
+    believed = result.loops.believed
+    return {
+        "found": len(believed),
+        "believed": int(believed.sum()),
+        "frames": np.stack([result.loops.a, result.loops.b], axis=1)[believed],
+        "moved_max_m": float(np.linalg.norm(moved, axis=1).max()) if believed.any() else 0.0,
     }
 
 
@@ -135,6 +148,7 @@ def accuracy(
         "alignment": "se3",
         "ate_rmse_m": ate.rmse,
         "ate_max_m": ate.max,
+        "ate_rmse_without_loops_m": trajectory_error.ate(result.T_world_cam_odometry, T_world_true).rmse,
         "rotation_rmse_deg": trajectory_error.statistics(rotation_deg).rmse,
         "frames_with_ground_truth": ate.frames,
         "frames_wrong": int(wrong.sum()),

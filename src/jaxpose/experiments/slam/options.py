@@ -19,7 +19,7 @@ from jaxpose.experiments.checks import (
 )
 from jaxpose.fields import PoseNetConfig
 from jaxpose.files import atomic
-from jaxpose.slam import SlamConfig
+from jaxpose.slam import LoopConfig, SlamConfig
 
 SMOKE_FRAMES = 8
 FEWEST_FRAMES = 3  # three camera centres are the fewest that an alignment can be wrong about
@@ -96,7 +96,7 @@ class Options:
         else:
             check_unused(self, [f"room.{name}" for name in RoomConfig.__dataclass_fields__], "with --data")
         if self.room.along is not None:
-            walk = ("speed", "imu_rate_hz", "imu_noise", "gravity_world")
+            walk = ("scene", "speed", "imu_rate_hz", "imu_noise", "gravity_world")
             check_unused(self, [f"room.{name}" for name in walk], "with --room.along")
 
     def _check_imu(self):
@@ -136,6 +136,11 @@ class Options:
         if slam.track.method == "gauss_newton" or slam.frame != "intrinsic":
             why = "without --track.method gradient and --frame intrinsic"
             check_unused(self, ("slam.track.dof_weight",), why)
+        if not slam.uses_loops:
+            names = [f"slam.loop.{name}" for name in LoopConfig.__dataclass_fields__]
+            check_unused(self, names, "where no loops are looked for")
+        if not replace(slam, loops=True).uses_loops:
+            check_unused(self, ("slam.loops",), "without features and a fused map")
         if slam.map.method == "fused":
             check_unused(self, [f"slam.map.{n}" for n in _RENDERED_MAPPING], "with --map.method fused")
 

@@ -71,6 +71,7 @@ def report(folder: Path, results: dict[str, Any]) -> str:
             f"{results['frames_lost']} of {results['frames']} frames, "
             f"{results['frames_uncertain']} uncertain",
         ),
+        *_loops(results),
         _line(
             "time per frame",
             f"{results['seconds_per_frame']:.3f} s  median after the first two, which compile; "
@@ -133,6 +134,18 @@ def _against_ground_truth(results: dict[str, Any]) -> list[str]:
             "from one frame to the next",
         ))  # fmt: skip
     return lines
+
+
+def _loops(results: dict[str, Any]) -> list[str]:
+    """The loops of a run, and what the trajectory would be without them."""
+    loops = results["loops"]
+    if not loops["found"]:
+        return [_line("loops", "none found")]
+    moved = f"{_cm(loops['moved_max_m'])} cm"
+    text = f"{loops['believed']} of {loops['found']} believed, which moved the camera by up to {moved}"
+    if "ate_rmse_without_loops_m" in results:
+        text += f"; ATE-RMSE {_cm(results['ate_rmse_without_loops_m'])} cm without: motions as tracked"
+    return [_line("loops", text)]
 
 
 def _map(quality: dict[str, Any]) -> list[str]:

@@ -18,6 +18,7 @@ from jaxpose.scenes.types import Params
 from jaxpose.scenes.voxel_blocks import BlockConfig, Blocks, blocks_of_grid, empty_blocks, voxel_blocks
 from jaxpose.slam.config import IMU_WEIGHTS, ImuWeights, MapConfig, SlamConfig, TrackConfig
 from jaxpose.slam.keyframes import FrameReader, choose, keyframe_images, overlap
+from jaxpose.slam.loops.drift import drift_to_last, may_be_doubled
 from jaxpose.slam.map.integrate import MapSample, grown_map, make_integrate, sample_map
 from jaxpose.slam.map.photometric import MapState, make_descend
 from jaxpose.slam.observation import Image, is_blank, sample_pixels
@@ -153,8 +154,7 @@ def grow_to_fit(frame: Frame, points: Float[np.ndarray, "n 3"], state: SlamState
     assert state.map is not None
     if isinstance(state.grid, BlockConfig):
         T_world_cam = state.frames.T_world_body[-1] @ state.T_body_cam
-        step = max(state.camera.width // _ALLOCATION_COLUMNS, 1)
-        measured = seen_points(frame, state.camera, T_world_cam, step=step)
+        measured = allocation_points(frame, state.camera, T_world_cam)
         return state._replace(map=grown_map(state.grid, state.map, measured))
     assert state.grid is not None
     lower, upper = bounds
@@ -162,6 +162,13 @@ def grow_to_fit(frame: Frame, points: Float[np.ndarray, "n 3"], state: SlamState
         return state
     larger, grown = grow(state.grid, state.map, bounds)
     return state._replace(grid=larger, map=grown)
+
+
+def allocation_points(
+    frame: Frame, camera: Camera, T_world_cam: Float[np.ndarray, "4 4"]
+) -> Float[np.ndarray, "n 3"]:
+    """World points of a frame, as many as it takes to touch all blocks that integrating it will change."""
+    return seen_points(frame, camera, T_world_cam, step=max(camera.width // _ALLOCATION_COLUMNS, 1))
 
 
 def is_mapped(state: SlamState, frame: Frame) -> bool:
@@ -197,7 +204,8 @@ def map_frame(
     config, frames, i = state.config, state.frames, state.frames.count - 1
     backend, T_world_cam = map_backend(state), frames.T_world_body @ state.T_body_cam
     kept = np.flatnonzero(frames.keyframe)
-    shares = overlap(points, T_world_cam[kept], state.camera) if len(kept) else np.zeros(0)
+    farthest = state.max_depth
+    shares = overlap(points, T_world_cam[kept], state.camera, farthest) if len(kept) else np.zeros(0)
     if config.map.method == "fused":
         updated = backend.update(state.map, image, jnp.asarray(T_world_cam[i], jnp.float32))
     else:
@@ -218,7 +226,13 @@ def map_frame(
             key,
         )
     is_new = not len(kept) or shares.max() < config.keyframe_overlap
-    return state._replace(map=updated, frames=frames.put(i, mapped=True, keyframe=is_new))
+    if config.uses_loops and not is_new:  # keyframes from before a loop that is still open do not count
+        assert state.features is not None
+        chosen, depth = np.append(kept, i), state.features.usual_depth
+        doubled = may_be_doubled(state, chosen, drift_to_last(state, chosen), depth)[:-1]
+        is_new = bool(shares[~doubled].max(initial=0) < config.keyframe_overlap)
+    frames = frames.put(i, mapped=True, keyframe=is_new, exposure=np.asarray(image.exposure))
+    return state._replace(map=updated, frames=frames)
 
 
 def as_blocks(state: SlamState) -> tuple[BlockConfig, Blocks]:

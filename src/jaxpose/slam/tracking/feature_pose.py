@@ -17,7 +17,7 @@ _USUAL = 30  # frames that say what is usual
 _GO_TOGETHER = 10.0
 _ENOUGH = 60  # features of keyframes: with fewer those of the last frame are taken too, which drift
 _MATCHED = 3  # images that a frame's features are matched with
-_FIRST_SCALE = 30.0  # of the covariance of poses by features, before any has been compared: measured 6 to 200
+FIRST_SCALE = 30.0  # of the covariance of poses by features, before any has been compared: measured 6 to 200
 _CHI2_MEDIAN, _CHI2_999 = 5.35, 22.46  # of 6 degrees of freedom
 
 
@@ -70,7 +70,7 @@ def feature_nis(
 def _feature_scale(frames: Frames) -> float:
     """How many times larger than stated the covariance of poses by features has been so far."""
     known = frames.feature_nis[np.isfinite(frames.feature_nis)][-_USUAL:]
-    return max(float(np.median(known)) / _CHI2_MEDIAN, 1.0) if len(known) >= 5 else _FIRST_SCALE
+    return max(float(np.median(known)) / _CHI2_MEDIAN, 1.0) if len(known) >= 5 else FIRST_SCALE
 
 
 def with_features(
