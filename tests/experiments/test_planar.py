@@ -245,7 +245,7 @@ def test_the_pyramid_finds_motions_to_a_hundredth_of_a_pixel():
     assert found.corner_px[0] > 5 and errors.max() < 0.02
     assert found.corner_px[-1] == pytest.approx(errors[1:].mean())
     assert [step for step, *_ in told] == list(range(1, pyramid.count(photo.crop) + 1))
-    assert len(found.loss) == len(told) and found.loss[-1] < 1e-2 * found.loss[-pyramid.STEPS]
+    assert len(found.loss) == len(told) and found.loss[-1] < 1e-2 * found.loss[-pyramid.LAST_STEPS]
     assert found.psnr > 60
     seen = planar_task.covered(photo, task.H_image_patch)
     assert alignment.psnr((found.picture - photo.rgb)[seen]) > 40, "the picture is the photograph"
@@ -368,7 +368,7 @@ def test_homographies(found_at_once, photograph, tmp_path):
 
 def test_the_protocol_of_the_pyramid(found_at_once, photograph, tmp_path):
     outcome = planar.run(planar.Config(image=photograph, motions=1, out=tmp_path / "fast"))
-    assert "preset fast, 12 steps" in report(*outcome)
+    assert "preset fast, 16 steps" in report(*outcome)
     assert outcome.results["protocol"]["blurs_px"] == pytest.approx([64 / 15, 32 / 15, 0])
 
 

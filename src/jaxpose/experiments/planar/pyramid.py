@@ -20,9 +20,12 @@ from jaxpose.experiments.planar.alignment import Align, Aligned, psnr
 from jaxpose.experiments.planar.task import Photo, Task, apply, corner_errors, corners, pixels, rigid
 from jaxpose.experiments.planar.warps import Warps, coordinates
 
-STEPS = 4  # on each level
+STEPS, LAST_STEPS = 6, 4  # on each level with a blur, on the last
 _WIDEST = 2 / 15  # standard deviation of the widest blur, as a share of a patch's side
-_NARROWEST_PX = 2.0  # the last but one; the last level has none
+_NEAR_PX, _NARROWEST_PX = (
+    6.5,
+    2.0,
+)  # of blurs: see below; the narrowest, before the last level, which has none
 _RIDGE = 1e-3  # in points, that pulls every pixel of the grid to the mean: it decides where no patch lies
 _DAMPING = 1e-6  # of the mean eigenvalue of the normal equations in the field's parameters
 _SWEEPS, _STEP_SWEEPS, _PICTURE_SWEEPS = 20, 5, 60  # of conjugate gradients: image, warps' step, last image
@@ -32,14 +35,16 @@ _REACH = 2.0  # pixels of the level's grid that a step may move a point by
 
 def blurs(crop: int) -> list[float]:
     """Standard deviations [px] of the levels' blurs, for patches of `crop` pixels a side."""
-    widest = _WIDEST * crop
-    count = max(1, int(np.log2(widest / _NARROWEST_PX)) + 1)
-    return [widest / 2**k for k in range(count)] + [0.0]
+    found = [_WIDEST * crop]
+    # In small steps while patches may be far off, in halves after that.
+    while found[-1] / 2 >= _NARROWEST_PX:
+        found.append(found[-1] / (math.sqrt(2) if found[-1] > _NEAR_PX else 2))
+    return [*found, 0.0]
 
 
 def count(crop: int) -> int:
     """Steps on all levels together."""
-    return STEPS * len(blurs(crop))
+    return STEPS * (len(blurs(crop)) - 1) + LAST_STEPS
 
 
 def by_gauss_newton(photo: Photo, warps: Warps) -> Align:
@@ -77,7 +82,7 @@ def by_gauss_newton(photo: Photo, warps: Warps) -> Align:
 
         q = measured()
         for level in _levels(photo, task):
-            for _ in range(STEPS):
+            for _ in range(STEPS if level.spacing > 1 else LAST_STEPS):
                 params, loss = stepped(level, params, q)
                 losses.append(loss)
                 q = measured()
