@@ -9,7 +9,7 @@ import jaxpose
 
 LAYERS = (
     "errors _checks _terminal geometry files nn nn_columns optim losses fields scenes render imu events"
-    " estimate evaluation datasets training slam plots experiments cli __main__"
+    " estimate evaluation structure datasets training slam plots experiments cli __main__"
 ).split()
 PACKAGE = Path(jaxpose.__file__).parent
 

@@ -16,6 +16,7 @@ from jaxpose._checks import check_shapes
 from jaxpose.geometry.camera import Camera, unproject
 
 Spacing = Literal["depth", "disparity"]
+ENDLESS = 1e10  # interval of the last sample, which closes the ray
 
 
 @runtime_checkable
@@ -39,6 +40,13 @@ class Ray(NamedTuple):
 
     origin: Float[Array, "*n 3"]
     direction: Float[Array, "*n 3"]
+
+
+class Samples(NamedTuple):
+    """Where a ray is looked at: depths, and the length of ray [units of depth] that each stands for."""
+
+    depth: Float[Array, "*n s"]
+    interval: Float[Array, "*n s"]
 
 
 class Rendered(NamedTuple):
@@ -120,17 +128,32 @@ def sample_depths(
     return 1 / jnp.maximum((1 - share) / near + share / far, 1e-8)
 
 
+def to_next(depth: Float[Array, " s"]) -> Samples:
+    """Samples that stand for the ray as far as the next one; the last, as in NeRF, for all that is behind.
+
+    Args:
+        depth: Increasing depths.
+
+    Returns:
+        The same depths with their intervals.
+    """
+    return Samples(depth, jnp.append(jnp.diff(depth), jnp.asarray(ENDLESS, depth.dtype)))
+
+
 def density_weights(
-    density: Float[Array, " s"], depth: Float[Array, " s"], *, length: float | Float[Array, ""] = 1.0
+    density: Float[Array, " s"],
+    depth: Float[Array, " s"],
+    *,
+    length: float | Float[Array, ""] = 1.0,
+    interval: Float[Array, " s"] | None = None,
 ) -> Float[Array, " s"]:
     """Probability that the ray ends at each sample, from volume densities (Mildenhall et al. 2020, eq. 3).
-
-    The last interval has no end, as in NeRF: what stands at the last sample closes the ray.
 
     Args:
         density: Volume densities >= 0 per unit of length.
         depth: Increasing depths of the samples.
         length: Length of one unit of depth along the ray: the norm of its direction, where depth is z-depth.
+        interval: Length of ray [units of depth] that each sample stands for; None: as `to_next` has it.
 
     Returns:
         Weights that sum up to at most 1.
@@ -142,7 +165,7 @@ def density_weights(
     [0.0, 0.5, 0.0]
     """
     _check_samples(density=density, depth=depth)
-    tau = density * (jnp.append(jnp.diff(depth), jnp.asarray(1e10, depth.dtype)) * length)
+    tau = density * ((to_next(depth).interval if interval is None else interval) * length)
     return -jnp.expm1(-tau) * jnp.exp(-_before(tau))
 
 

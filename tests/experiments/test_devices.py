@@ -51,7 +51,7 @@ def test_bad_options_are_one_line(args, expected, tmp_path, monkeypatch):
 
 
 def test_a_study_is_no_training_of_several_processes():
-    args = "--study fields --devices.processes 2 --devices.coordinator a:1".split()
+    args = "--study fields --preset joint --devices.processes 2 --devices.coordinator a:1".split()
     assert "--study: expected one process" in complaint(*args)
 
 

@@ -13,6 +13,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from jaxpose import fields, scenes
 from jaxpose.geometry import rigid, se3
 from jaxpose.geometry.camera import Camera
+from jaxpose.render import Ray
 from jaxpose.scenes import NerfConfig
 from jaxpose.training import photometric
 from jaxpose.training.photometric import Depths, TrainConfig, Views
@@ -208,3 +209,32 @@ def test_refinement_on_either_side():
     for side, expected in ((right, starts @ moves), (left, moves @ starts)):
         refined = side(field, initial)
         assert_allclose(jax.jit(jax.vmap(partial(refined.pose, params)))(T), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("spacing", ["depth", "disparity"])
+def test_samples_go_where_something_may_be(spacing):
+    """A slab between 2.6 and 2.9 of a ray from 1 to 5: most samples, and the whole ray in their intervals."""
+    slab = lambda params, point: jnp.where((point[2] > 2.6) & (point[2] < 2.9), 50.0, 0.0)
+    sampler = photometric.importance(Depths(1.0, 5.0, spacing), slab, 40)
+    ray = Ray(jnp.zeros(3), jnp.array([0.0, 0.0, 1.0]))
+    assert_allclose(sampler((), ray, None).depth, sampler((), ray, None).depth)  # the same at any time
+    for key in jax.random.split(jax.random.key(0), 5):
+        depth, interval = (np.asarray(x, np.float64) for x in sampler((), ray, key))
+        assert depth.shape == interval.shape == (41,)
+        assert (np.diff(depth) > 0).all() and depth[0] > 1 and depth[-1] == 5
+        assert 0.5 < np.mean((depth > 2.5) & (depth < 3.0)) < 0.95
+        # Each sample is the middle of its interval, which begins where the one before ends.
+        begins, ends = depth - interval / 2, depth + interval / 2
+        assert_allclose(begins[1:-1], ends[:-2], atol=1e-5)
+        assert interval[-1] > 1e9
+
+
+def test_a_scene_seen_by_importance_is_that_seen_finely():
+    """The ball's colour and depth by 48 samples where it is, against 400 everywhere."""
+    params = {"centre": jnp.zeros(3)}
+    near = lambda params, point: jnp.where(jnp.sum(point**2) < 2.5, 100.0, 0.0)
+    sampler = photometric.importance(DEPTHS, near, 48)
+    pose = around(T)[1]
+    few = photometric.viewer(ball_scene(), CAMERA, DEPTHS, TrainConfig(), sampler=sampler).image(params, pose)
+    many = photometric.viewer(ball_scene(), CAMERA, DEPTHS, TrainConfig(samples=400)).image(params, pose)
+    assert_allclose(few[0], many[0], atol=0.02)

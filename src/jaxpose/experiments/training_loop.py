@@ -30,6 +30,7 @@ from jaxpose.training.steps import State, Trainer
 CHUNK = 100  # steps in one compiled call
 COLUMNS = ("step", "loss", "rotation_deg", "translation", "seconds")
 _SAVE_EVERY_S = 30.0
+_KEPT = "checkpoint.npz", "registration.npz", "results.json"  # of a run that is resumed
 
 
 @dataclass(frozen=True)
@@ -154,7 +155,7 @@ def set_up_run_folder(folder: Path, config: Any, settings: dict[str, Any]) -> No
     """
     stored = folder / "settings.json"
     settings = json.loads(json.dumps(settings, default=_plain))
-    if not own_folder(folder, stored, settings, config.resume, "checkpoint.npz", "results.json"):
+    if not own_folder(folder, stored, settings, config.resume, *_KEPT):
         atomic.write_json(stored, settings)
     atomic.write_json(folder / "config.json", config)
 

@@ -4,6 +4,10 @@ from ._image import ImageField as ImageField
 from ._image import image as image
 from ._nerf import NerfConfig as NerfConfig
 from ._nerf import nerf as nerf
+from ._planes import PlanesConfig as PlanesConfig
+from ._planes import occupancy as occupancy
+from ._planes import planes as planes
+from ._planes import with_occupancy as with_occupancy
 from .types import SceneField as SceneField
 from .voxel_grid import GridConfig as GridConfig
 from .voxel_grid import bounding_grid as bounding_grid

@@ -19,7 +19,7 @@ from jaxpose.fields import PoseField
 from jaxpose.geometry.camera import Camera
 from jaxpose.render import pixel_ray
 from jaxpose.scenes import SceneField
-from jaxpose.training.photometric import Depths, draw_depths, ray_colour
+from jaxpose.training.photometric import Depths, ray_colour, stratified
 from jaxpose.training.steps import Trainer, joint, microbatched_sum
 
 Loss = Literal["window", "asynchronous"]
@@ -95,12 +95,13 @@ def trainer(
     """
 
     def error(scene_params, item):
-        now, before, depth, change, mask = item
-        colour = lambda ray: ray_colour(scene, scene_params, ray, depth, config.background)[0]
+        now, before, samples, change, mask = item
+        colour = lambda ray: ray_colour(scene, scene_params, ray, samples, config.background)[0]
         residual = change_residual(colour(now), colour(before), change, mask, offset=config.offset)
         return jnp.sum(residual**2)
 
     total = microbatched_sum(error, min(config.chunk, config.events))
+    sample = stratified(depths, config.samples)
     draw = {"window": window_pairs, "asynchronous": asynchronous_pairs}[config.loss]
 
     def loss(scene_params, pose_params, data, key):
@@ -116,10 +117,11 @@ def trainer(
         pixel = jnp.stack([pairs.pixel % camera.width, pairs.pixel // camera.width], axis=-1)
         pixel = pixel.astype(T_now.dtype)
         rays = [jax.vmap(partial(pixel_ray, camera))(T, pixel) for T in (T_now, T_before)]
-        depth = draw_depths(depth_key, depths, rays=config.events, samples=config.samples)
-        change = config.threshold * pairs.change.astype(depth.dtype)
+        keys = jax.random.split(depth_key, config.events)
+        samples = jax.vmap(sample, (None, None, 0))(scene_params, None, keys)
+        change = config.threshold * pairs.change.astype(pixel.dtype)
         mask = data.mask[pairs.pixel] * pairs.weight[:, None]
-        return total(scene_params, (*rays, depth, change, mask)) / (3 * config.events)
+        return total(scene_params, (*rays, samples, change, mask)) / (3 * config.events)
 
     return joint(loss, scene.init, field.init, optimizer, config.steps)
 

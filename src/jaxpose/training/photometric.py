@@ -14,12 +14,14 @@ from jaxpose import optim, render
 from jaxpose.fields import PoseField
 from jaxpose.geometry import se3
 from jaxpose.geometry.camera import Camera, pixel_grid
-from jaxpose.render import Ray, Spacing, pixel_ray
+from jaxpose.render import Ray, Samples, Spacing, pixel_ray
 from jaxpose.scenes import SceneField
 from jaxpose.training.shutter import Shutter, exposure_times
 from jaxpose.training.steps import Trainer, joint, microbatched_sum
 
 Params = Any
+
+_OPAQUE, _CLEAR = 0.1, 2e-3  # weights of a part of a ray in `importance`: at most, and where nothing is
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,13 @@ class Views(NamedTuple):
     mask: Bool[Array, "n h w"] | None = None
 
 
+@runtime_checkable
+class Sampler(Protocol):
+    """Where a ray of a scene is looked at: drawn with a key, always the same without."""
+
+    def __call__(self, scene_params: Params, ray: Ray | None, key: PRNGKeyArray | None, /) -> Samples: ...
+
+
 def trainer(
     scene: SceneField,
     field: PoseField,
@@ -60,6 +69,7 @@ def trainer(
     optimizer: optax.GradientTransformation,
     config: TrainConfig = TrainConfig(),  # noqa: B008 - frozen
     shutter: Callable[[Params], Shutter] | None = None,
+    sampler: Sampler | None = None,
 ) -> Trainer:
     """Minimise the mean squared colour error of random rays, jointly over scene and poses (BARF).
 
@@ -74,18 +84,20 @@ def trainer(
         config: How many steps, rays and samples.
         shutter: Of the camera, from the pose field's parameters: a pixel's colour is then the mean of rays
             from the poses at the instants of its row's exposure. None: all of a photograph is seen at once.
+        sampler: Where a ray is looked at, by what is known of the scene; None: in equal parts of `depths`.
 
     Returns:
         A trainer whose data are `Views`.
     """
 
     def error(scene_params, item):
-        rays, depth, rgb, weight = item
-        colour = lambda ray: ray_colour(scene, scene_params, ray, depth)[0]
+        rays, samples, rgb, weight = item
+        colour = lambda ray: ray_colour(scene, scene_params, ray, samples)[0]
         seen = colour(rays) if shutter is None else jnp.mean(jax.vmap(colour)(rays), axis=0)
         return weight * jnp.sum((seen - rgb) ** 2)
 
     total = microbatched_sum(error, min(config.chunk, config.rays))
+    sample = sampler or stratified(depths, config.samples)
 
     def loss(scene_params, pose_params, views, key):
         view_key, pixel_key, depth_key = jax.random.split(key, 3)
@@ -102,7 +114,7 @@ def trainer(
             rays = jax.vmap(jax.vmap(from_pixel, (0, None)))(times(views.t[view], at[:, 1]), at)
         batch = (
             rays,
-            draw_depths(depth_key, depths, rays=config.rays, samples=config.samples),
+            _samples(sample, scene_params, rays, depth_key),
             _unit(views.rgb[view, pixel[:, 1], pixel[:, 0]]),
             _weights(views.mask, (view, pixel[:, 1], pixel[:, 0]), at.dtype),
         )
@@ -151,13 +163,14 @@ def viewer(
     depths: Depths,
     config: TrainConfig = TrainConfig(),  # noqa: B008 - frozen
     *,
+    sampler: Sampler | None = None,
     background: float | None = None,
     refine_steps: int = 100,
     refine_optimizer: optax.GradientTransformation = optax.adam(1e-3),  # noqa: B008 - functions
 ) -> Viewer:
     """Functions that render a trained scene, and refine the pose of an image it was not trained on.
 
-    `image` samples the middles of equal parts of each ray. `refine_pose` is BARF's test-time optimisation of
+    `image` samples the same depths of a ray at any time. `refine_pose` is BARF's test-time optimisation of
     one pose, the scene at rest, on `config.rays` random pixels a step.
 
     Args:
@@ -165,6 +178,7 @@ def viewer(
         camera: Intrinsics of the images.
         depths: Where samples lie along the optical axis.
         config: How many rays and samples.
+        sampler: Where a ray is looked at, by what is known of the scene; None: in equal parts of `depths`.
         background: Known colour behind the scene in [0, 1], as `ray_colour` takes it.
         refine_steps: How many steps `refine_pose` takes.
         refine_optimizer: Any optax transformation of a twist (6,).
@@ -172,19 +186,37 @@ def viewer(
     Returns:
         The two functions.
     """
-    colour = lambda params, ray, depth: ray_colour(scene, params, ray, depth, background)
+    colour = lambda params, ray, samples: ray_colour(scene, params, ray, samples, background)
+    sample = sampler or stratified(depths, config.samples)
 
     def image(scene_params, T_world_cam):
         pixels = jnp.asarray(pixel_grid(camera), T_world_cam.dtype)
-        depth = render.sample_depths(None, depths.near, depths.far, config.samples, spacing=depths.spacing)
-        one = lambda pixel: colour(scene_params, pixel_ray(camera, T_world_cam, pixel), depth)
+
+        def one(pixel):
+            ray = pixel_ray(camera, T_world_cam, pixel)
+            return colour(scene_params, ray, sample(scene_params, ray, None))
+
         rgb, found = jax.lax.map(one, pixels.reshape(-1, 2), batch_size=config.chunk)
         return rgb.reshape(pixels.shape[0], -1, 3), found.reshape(pixels.shape[:2])
 
+    refine_pose = _refiner(colour, sample, camera, config, refine_steps, refine_optimizer)
+    return Viewer(jax.jit(image), jax.jit(refine_pose))
+
+
+def _refiner(
+    colour: Callable[..., Any],
+    sample: Sampler,
+    camera: Camera,
+    config: TrainConfig,
+    steps: int,
+    optimizer: optax.GradientTransformation,
+) -> RefinePose:
+    """The function that refines a pose, for a `viewer`."""
+
     def refine_pose(scene_params, T_world_cam, rgb, key, mask=None):
         def error(_, item):
-            ray, depth, seen, weight = item
-            return weight * jnp.sum((colour(scene_params, ray, depth)[0] - seen) ** 2)
+            ray, samples, seen, weight = item
+            return weight * jnp.sum((colour(scene_params, ray, samples)[0] - seen) ** 2)
 
         total = microbatched_sum(error, min(config.chunk, config.rays))
 
@@ -192,25 +224,26 @@ def viewer(
             pixel_key, depth_key = jax.random.split(jax.random.fold_in(key, step))
             pixel = _pixels(pixel_key, config.rays, *rgb.shape[:2])
             moved = se3.compose(se3.exp(twist), T_world_cam)
+            rays = jax.vmap(partial(pixel_ray, camera, moved))(pixel.astype(moved.dtype))
             batch = (
-                jax.vmap(partial(pixel_ray, camera, moved))(pixel.astype(moved.dtype)),
-                draw_depths(depth_key, depths, rays=config.rays, samples=config.samples),
+                rays,
+                _samples(sample, scene_params, rays, depth_key),
                 _unit(rgb[pixel[:, 1], pixel[:, 0]]),
                 _weights(mask, (pixel[:, 1], pixel[:, 0]), moved.dtype),
             )
             return _mean(total((), batch), batch[-1])
 
-        twist = optim.minimize(loss, jnp.zeros(6, T_world_cam.dtype), refine_optimizer, refine_steps).params
+        twist = optim.minimize(loss, jnp.zeros(6, T_world_cam.dtype), optimizer, steps).params
         return se3.compose(se3.exp(twist), T_world_cam)
 
-    return Viewer(jax.jit(image), jax.jit(refine_pose))
+    return refine_pose
 
 
 def ray_colour(
     scene: SceneField,
     scene_params: Params,
     ray: Ray,
-    depth: Float[Array, " s"],
+    samples: Samples,
     background: float | None = None,
 ) -> tuple[Float[Array, "3"], Float[Array, ""]]:
     """Colour and expected depth along one ray through a scene with a volume density.
@@ -222,7 +255,7 @@ def ray_colour(
         scene: The scene, and
         scene_params: its parameters.
         ray: A ray whose direction has length 1 along the optical axis, as `pixel_ray` gives it.
-        depth: Increasing depths of the samples along the optical axis [scene units].
+        samples: Where it is looked at, along the optical axis [scene units].
         background: Colour behind the scene in [0, 1]; None: there is none.
 
     Returns:
@@ -231,10 +264,10 @@ def ray_colour(
 
     def weights(density, depth):
         length = jnp.linalg.norm(ray.direction)
-        ends = render.density_weights(density, depth, length=length)
+        ends = render.density_weights(density, depth, length=length, interval=samples.interval)
         return ends if background is None else ends.at[-1].set(0)
 
-    rendered = render.render_ray(partial(scene.query, scene_params), ray, depth, weights=weights)
+    rendered = render.render_ray(partial(scene.query, scene_params), ray, samples.depth, weights=weights)
     if background is None:
         return rendered.rgb, rendered.depth
     return rendered.opacity * rendered.rgb + (1 - rendered.opacity) * background, rendered.depth
@@ -256,22 +289,74 @@ def _mean(total: Float[Array, ""], weights: Float[Array, " rays"]) -> Float[Arra
     return total / (3 * jnp.maximum(jnp.sum(weights), 1))
 
 
-def draw_depths(
-    key: PRNGKeyArray, depths: Depths, *, rays: int, samples: int
-) -> Float[Array, "rays samples"]:
-    """Increasing depths for each of many rays, drawn as `render.sample_depths` does.
+def stratified(depths: Depths, samples: int) -> Sampler:
+    """One sample in each of equal parts of every ray, drawn with a key, as `render.sample_depths` does.
 
     Args:
-        key: A random key.
         depths: The range [scene units], and what is equally spaced in it.
-        rays: How many rays.
-        samples: How many depths of each.
+        samples: How many.
 
     Returns:
-        Depths along the optical axis [scene units].
+        The sampler; it looks at neither scene nor ray.
     """
-    draw = lambda key: render.sample_depths(key, depths.near, depths.far, samples, spacing=depths.spacing)
-    return jax.vmap(draw)(jax.random.split(key, rays))
+
+    def sample(scene_params: Params, ray: Ray | None, key: PRNGKeyArray | None) -> Samples:
+        del scene_params, ray
+        found = render.sample_depths(key, depths.near, depths.far, samples, spacing=depths.spacing)
+        return render.to_next(found)
+
+    return sample
+
+
+def importance(
+    depths: Depths,
+    density: Callable[[Params, Float[Array, "3"]], Float[Array, ""]],
+    samples: int,
+    *,
+    coarse: int = 64,
+) -> Sampler:
+    """Samples where a ray may meet something, and one at its end, which closes it.
+
+    Equal parts of the ray share the samples by their opacity, up to a limit (after the fine samples of
+    Mildenhall et al. 2020, whose first pass is here a look at what is known of the scene).
+
+    Args:
+        depths: The range [scene units], and what is equally spaced in it.
+        density: `density(scene_params, point)`, the density that the scene may have at a point.
+        samples: How many, the last one apart.
+        coarse: How many parts.
+
+    Returns:
+        The sampler, of `samples` + 1 depths.
+    """
+    share = jnp.linspace(0.0, 1.0, coarse + 1)
+    edges = depths.near + (depths.far - depths.near) * share
+    if depths.spacing == "disparity":
+        edges = 1 / jnp.maximum((1 - share) / depths.near + share / depths.far, 1e-8)
+    middle, width = (edges[1:] + edges[:-1]) / 2, jnp.diff(edges)
+
+    def sample(scene_params: Params, ray: Ray | None, key: PRNGKeyArray | None) -> Samples:
+        assert ray is not None
+        points = ray.origin[None] + middle[:, None] * ray.direction[None]
+        found = jax.vmap(density, (None, 0))(scene_params, points)
+        weight = jnp.minimum(found * width * jnp.linalg.norm(ray.direction), _OPAQUE) + _CLEAR
+        total = jnp.concatenate([jnp.zeros(1), jnp.cumsum(weight)])
+        shift = 0.5 if key is None else jax.random.uniform(key, ())
+        wanted = (jnp.arange(samples + 1, dtype=total.dtype) + shift) / (samples + 1) * total[-1]
+        part = jnp.clip(jnp.searchsorted(total, wanted, side="right") - 1, 0, coarse - 1)
+        cut = edges[part] + (wanted - total[part]) / weight[part] * width[part]
+        depth = jnp.append((cut[1:] + cut[:-1]) / 2, edges[-1])
+        return jax.lax.stop_gradient(Samples(depth, jnp.append(jnp.diff(cut), render.ENDLESS)))
+
+    return sample
+
+
+def _samples(sampler: Sampler, scene_params: Params, rays: Ray, key: PRNGKeyArray) -> Samples:
+    """Those of many rays, drawn for each anew; rays of one exposure share those of the middle one."""
+    if rays.origin.ndim == 3:
+        rays = jax.tree.map(lambda x: x[:, x.shape[1] // 2], rays)
+    keys = jax.random.split(key, len(rays.origin))
+    return jax.vmap(sampler, (None, 0, 0))(scene_params, rays, keys)
 
 
 def _unit(rgb: UInt8[Array, "*n 3"]) -> Float[Array, "*n 3"]:

@@ -42,9 +42,11 @@ def of_radiance(folder: Path, first: float) -> Render:
         loaded = event_nerf.load_run(folder)
         problem = loaded.problem
         camera, depths, background = problem.recording.camera, problem.depths, problem.background
+        sampler = None
     elif experiment == "noisy_nerf":
         loaded = noisy_nerf.load_run(folder)
         camera, depths, background = loaded.problem.train.camera, loaded.model.depths, None
+        sampler = loaded.model.sampler
     else:
         raise DataError(f"{folder}: expected a run of noisy_nerf or event_nerf, got {experiment}")
     model, state = loaded.model, loaded.state
@@ -54,7 +56,8 @@ def of_radiance(folder: Path, first: float) -> Render:
     @cache
     def image(width: int) -> Callable:
         small = scale(camera, min(1.0, width / camera.width))
-        return photometric.viewer(model.scene, small, depths, config, background=background).image
+        look = photometric.viewer(model.scene, small, depths, config, sampler=sampler, background=background)
+        return look.image
 
     def render(t: float, width: int) -> Picture:
         return _picture(image(width)(state.scene, pose(jnp.float32(first + t)))[0])

@@ -69,6 +69,7 @@ def measure(
         model.train,
         refine_steps=config.test_pose_steps,
         refine_optimizer=optax.adam(model.refine_rate),
+        sampler=model.sampler,
     )
     scene = set_progress(state.scene, jnp.ones(()))
     if not np.isfinite(problem.train.T_world_cam).all():

@@ -6,31 +6,41 @@ from dataclasses import asdict, replace
 from functools import partial
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 from jaxtyping import Array, Float
 from scipy.interpolate import make_splrep
 
-from jaxpose import fields
+from jaxpose import fields, optim, scenes
 from jaxpose.datasets.types import Photographs
+from jaxpose.experiments import training_loop
 from jaxpose.experiments.noisy_nerf.options import ORBIT, Config, Problem
-from jaxpose.experiments.training_loop import CHUNK
+from jaxpose.experiments.noisy_nerf.registration import Registered
+from jaxpose.experiments.training_loop import CHUNK, Trained
 from jaxpose.fields import PoseField, PoseNetConfig
-from jaxpose.scenes import NerfConfig, SceneField, nerf
-from jaxpose.training.photometric import Depths, TrainConfig, Views, trainer
+from jaxpose.geometry import se3
+from jaxpose.scenes import NerfConfig, PlanesConfig, SceneField, nerf, with_occupancy
+from jaxpose.training.photometric import Depths, Sampler, TrainConfig, Views, importance, trainer
 from jaxpose.training.shutter import Shutter, shutter_of, with_shutter
-from jaxpose.training.steps import Decay, Trainer, adam
+from jaxpose.training.steps import Decay, State, Trainer, adam
 
-_FAST_SCENE = NerfConfig(
+_JOINT_SCENE = NerfConfig(
     layers=4, width=96, skip=2, colour_width=48, octaves=7, window=(0.15, 0.5), zero_bands=True
 )
 _SMOKE_SCENE = NerfConfig(layers=2, width=16, skip=None, colour_width=8, octaves=4, window=(0.1, 0.5))
-_FAST = TrainConfig(steps=5000, rays=1024, samples=32, chunk=64)
+_JOINT = TrainConfig(steps=5000, rays=1024, samples=32, chunk=64)
+_FAST = TrainConfig(steps=4000, rays=1024, samples=24, chunk=1024)
 PAPER = TrainConfig(steps=200_000, rays=4096, samples=128, chunk=32)
 _SMOKE = TrainConfig(steps=CHUNK, rays=64, samples=8, chunk=32)
 # In short trainings on poses far off: first a blurred scene forms, then the cameras move to where it is seen,
 # then they turn. Free at once, they run after a scene that does not exist yet, and do not come back.
 _SHIFT_FROM, _TURN_FROM = 0.03, 0.06  # shares of the training
+# Poses by features stay until there is a scene: for so many rays, and at least this share of the training.
+_FORMED_RAYS, _REGISTERED_FROM = 250_000, 0.05
+_GRID_RATE, _DECODER_RATE = Decay(1e-2, 1e-3), Decay(2e-3, 2e-4)
+_FIT_RATE, _FIT_STEPS = 5e-4, 600
 # Parallax alone tells how cameras in one place have turned, and a blurred scene does not show it.
 _UNKNOWN_WINDOW = (0.0, 0.05)
 # Adam's first and last rate for translation and rotation, by how the training goes.
@@ -62,45 +72,118 @@ class Model(NamedTuple):
     trainer: Trainer
     shutter: Callable[[Any], Shutter] | None  # from the pose field's parameters
     refine_rate: float  # of the test-time pose refinement
+    sampler: Sampler | None = None  # where rays are looked at; None: in equal parts
+    between: Callable[[State], State] | None = None  # what is done to the state after every chunk of steps
 
 
-def build(config: Config, problem: Problem) -> Model:
-    """Scene, pose field and rates that the config names, for these photographs."""
-    photographs, paper = problem.train, config.preset == "paper"
+def build(config: Config, problem: Problem, registered: Registered | None = None) -> Model:
+    """Scene, pose field and rates that the config names, for photographs and their registration, if any."""
+    photographs = problem.train
     barf = photographs.spacing
-    if config.smoke:
-        scene, train = nerf(_SMOKE_SCENE), _SMOKE
-    else:
-        scene, train = (nerf(), PAPER) if paper else (nerf(_fast_scene(config)), _FAST)
-        train = replace(train, steps=config.steps or train.steps, rays=config.rays or train.rays)
+    scene, scene_rates, train, sampler, between = (
+        _perceptron(config, problem) if registered is None else _planes(config, problem, registered)
+    )
     train = replace(train, chunk=config.devices.chunk(train.chunk))
-    scene_rate = Decay(5e-4 if paper and barf == "depth" else 1e-3, 1e-4)
     t = jnp.asarray(photographs.t, jnp.float32)
-    rates = _rates(config, problem)
-    start = fields.piecewise_geodesic(t, jnp.asarray(problem.T_start, jnp.float32))
-    correct = fields.left_correction if config.side == "world" else fields.right_correction
-    field = correct(_correction(config, problem), start)
+    rates = _rates(config, problem, registered, train)
+    field = _corrected(config, problem, registered)
     pose_rates = _pose_rates(config, rates, train.steps)
     shutter = _shutter(config)
     if config.shutter == "estimate":
         field, pose_rates, shutter = _estimated_shutter(config, photographs, field, pose_rates)
-    optimizer = adam({"scene": scene_rate, "pose": pose_rates}, train.steps)
+    optimizer = adam({"scene": scene_rates, "pose": pose_rates}, train.steps)
     depths = Depths(photographs.near, photographs.far, photographs.spacing)
+    if registered is not None:
+        depths = depths._replace(near=registered.near, far=registered.far)
+    views = Views(
+        t,
+        jnp.asarray(photographs.rgb),
+        None if photographs.mask is None else jnp.asarray(photographs.mask),
+    )
+    named = scene_rates if isinstance(scene_rates, dict) else {"scene": scene_rates}
     return Model(
         scene,
         field,
-        {"scene": scene_rate, **rates},
+        {**{name: rate for name, rate in named.items() if rate}, **rates},
         train,
         depths,
-        Views(
-            t,
-            jnp.asarray(photographs.rgb),
-            None if photographs.mask is None else jnp.asarray(photographs.mask),
-        ),
-        trainer(scene, field, photographs.camera, depths, optimizer, train, shutter),
+        views,
+        trainer(scene, field, photographs.camera, depths, optimizer, train, shutter, sampler),
         shutter,
         _BARF_REFINE[barf],
+        sampler,
+        between,
     )
+
+
+def initial_state(config: Config, problem: Problem, model: Model, registered: Registered | None) -> Trained:
+    """A training at its start: a PoseNet that begins at the given poses is brought to those registered."""
+    trained = training_loop.initial_state(model, config.seed)
+    if registered is None or not _from_given_poses(config):
+        return trained
+    pose = trained.state.pose
+    inner = pose["field"] if config.shutter == "estimate" else pose
+    fitted = _fitted(_corrected(config, problem, registered), inner, problem, registered)
+    pose = pose | {"field": fitted} if config.shutter == "estimate" else fitted
+    return trained._replace(state=trained.state._replace(pose=pose))
+
+
+def _perceptron(config: Config, problem: Problem) -> tuple[Any, ...]:
+    """NeRF's network, which registers photographs by their colours alone."""
+    paper = config.preset == "paper"
+    if config.smoke:
+        scene, train = nerf(_SMOKE_SCENE), _SMOKE
+    else:
+        scene, train = (nerf(), PAPER) if paper else (nerf(_joint_scene(config)), _JOINT)
+        train = replace(train, steps=config.steps or train.steps, rays=config.rays or train.rays)
+    rate = Decay(5e-4 if paper and problem.train.spacing == "depth" else 1e-3, 1e-4)
+    return scene, rate, train, None, None
+
+
+def _planes(config: Config, problem: Problem, registered: Registered) -> tuple[Any, ...]:
+    """Planes and lines, which are sharp soon where poses are nearly right."""
+    planes = PlanesConfig(registered.centre, registered.half)
+    train = replace(_FAST, steps=config.steps or _FAST.steps, rays=config.rays or _FAST.rays)
+    train = replace(train, chunk=train.rays)
+    depths = Depths(registered.near, registered.far, problem.train.spacing)
+    sampler = importance(depths, partial(scenes.occupancy, planes), train.samples)
+    emptied = jax.jit(lambda scene: with_occupancy(planes, scene))
+    between = lambda state: state._replace(scene=emptied(state.scene))
+    rates = {"grids": _GRID_RATE, "decoder": _DECODER_RATE, "occupancy": 0.0, "progress": 0.0}
+    return scenes.planes(planes), rates, train, sampler, between
+
+
+def _from_given_poses(config: Config) -> bool:
+    """Whether a PoseNet undoes the disturbance itself, as it is smooth; else it starts registered."""
+    return config.pose == "posenet" and config.noise in ("correlated", "unknown")
+
+
+def _corrected(config: Config, problem: Problem, registered: Registered | None) -> PoseField:
+    """The poses to start from, and their correction."""
+    t, T_start = problem.train.t, problem.T_start
+    if registered is not None and not _from_given_poses(config):
+        t, T_start = t[registered.supported], registered.T_world_cam[registered.supported]
+    start = fields.piecewise_geodesic(jnp.asarray(t, jnp.float32), jnp.asarray(T_start, jnp.float32))
+    correct = fields.left_correction if config.side == "world" else fields.right_correction
+    return correct(_correction(config, problem), start)
+
+
+def _fitted(field: PoseField, params: Any, problem: Problem, registered: Registered) -> Any:
+    """The parameters at which a field goes through the registered poses."""
+    known = registered.supported
+    t = jnp.asarray(problem.train.t[known], jnp.float32)
+    goal = jnp.asarray(registered.T_world_cam[known], jnp.float32)
+    lengths = (registered.near * registered.far) ** 0.5 if np.isfinite(registered.far) else registered.near
+    lengths = min(lengths, 10 * registered.near)  # a move seen from there is as large as a turn
+    units = jnp.array([lengths] * 3 + [1.0] * 3)
+
+    def loss(params, step):
+        T = jax.vmap(field.pose, (None, 0))(params, t)
+        off = jax.vmap(lambda a, b: se3.log(se3.compose(se3.inverse(a), b)))(T, goal)
+        return jnp.mean(jnp.sum((off / units[None]) ** 2, axis=-1))
+
+    rate = optax.exponential_decay(_FIT_RATE, _FIT_STEPS, 0.02)
+    return jax.jit(lambda p: optim.minimize(loss, p, optax.adam(rate), _FIT_STEPS).params)(params)
 
 
 def splined(
@@ -199,7 +282,9 @@ def _estimated_shutter(
     )
 
 
-def _rates(config: Config, problem: Problem) -> dict[str, Decay]:
+def _rates(
+    config: Config, problem: Problem, registered: Registered | None, train: TrainConfig
+) -> dict[str, Decay]:
     """Rates of translation and rotation of the pose field."""
     paper = config.preset == "paper"
     start = "unknown" if config.noise == "unknown" else "noisy"
@@ -209,6 +294,10 @@ def _rates(config: Config, problem: Problem) -> dict[str, Decay]:
         shift = turn = (3e-3 if problem.train.spacing == "disparity" else 1e-3, 1e-5)
     else:
         shift, turn = _PER_FRAME_RATES[start]
+    if registered is not None:
+        shift, turn = (_NET_RATES if config.pose == "posenet" else _PER_FRAME_RATES)["noisy"]
+        start = min(max(_FORMED_RAYS / (train.rays * train.steps), _REGISTERED_FROM), 0.5)
+        return {"translation": Decay(*shift, start), "rotation": Decay(*turn, start)}
     shift_from, turn_from = (0.0, 0.0) if paper else (_SHIFT_FROM, _TURN_FROM)
     return {"translation": Decay(*shift, shift_from), "rotation": Decay(*turn, turn_from)}
 
@@ -224,5 +313,5 @@ def _pose_rates(config: Config, rates: dict[str, Decay], steps: int) -> Any:
     return lambda step: jnp.where(columns, shift(step), turn(step))
 
 
-def _fast_scene(config: Config) -> NerfConfig:
-    return replace(_FAST_SCENE, window=_UNKNOWN_WINDOW) if config.noise == "unknown" else _FAST_SCENE
+def _joint_scene(config: Config) -> NerfConfig:
+    return replace(_JOINT_SCENE, window=_UNKNOWN_WINDOW) if config.noise == "unknown" else _JOINT_SCENE

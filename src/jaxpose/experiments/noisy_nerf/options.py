@@ -28,11 +28,12 @@ from jaxpose.experiments.training_loop import CHUNK, NetConfig
 from jaxpose.geometry import rigid
 
 Pose = Literal["posenet", "per_frame", "bspline", "spline_reset"]
+Preset = Literal["fast", "joint", "paper"]
 ShutterMode = Literal["known", "estimate", "ignore"]
 Study = Literal["fields", "encoding", "size", "spline", "ablations"]
 ORBIT = Path("orbit")
 _FAR = 100.0  # times the cameras' extent: a world so far from its origin is worked on near it
-_WIDTHS = {"fast": 100, "paper": 400}  # [px]
+_WIDTHS = {"fast": 100, "joint": 100, "paper": 400}  # [px]
 _SMOKE_WIDTH, _SMOKE_VIEWS = 24, 8
 
 
@@ -54,7 +55,9 @@ class Config:
     data: Path = ORBIT
     # The pose field. spline_reset: a pose per image, reset to a smoothing spline every 100 steps.
     pose: Pose = "posenet"
-    preset: Literal["fast", "paper"] = "fast"  # a small network for CPUs, or BARF's with the paper's schedule
+    # fast: poses by features that photographs share, then a scene of planes with the pose field; joint: all
+    # by the colours, with a small network for CPUs; paper: so with BARF's network and the paper's schedule.
+    preset: Preset = "fast"
     # Of the poses that the run starts from. "none": as the data has them; "unknown": all in one place.
     noise: Literal["correlated", "independent", "none", "unknown"] = "correlated"
     noise_translation: float = 0.2  # largest deviation, as a share of the largest distance between cameras
@@ -75,7 +78,7 @@ class Config:
     # the orbit, else from those given; "ignore": the orbit is trained as if it had neither.
     shutter: ShutterMode = "known"
     seed: int = 0  # of the noise, the network's start, the rays
-    steps: int | None = None  # None: 5000, with preset paper 200,000
+    steps: int | None = None  # None: 4000, with preset joint 5000, paper 200,000
     rays: int | None = None  # per step; None: 1024, with preset paper 4096
     net: NetConfig = NetConfig()
     spline_knots: int = 25  # of both splines
@@ -104,6 +107,10 @@ class Config:
             raise ValueError(f"--steps: expected a multiple of {CHUNK}, got {self.steps}")
         check_run_folder(self, None if self.data == ORBIT else self.data)
         check_devices(self)
+        if self.study is not None and self.preset == "fast":
+            raise ValueError(
+                "--study: expected --preset joint or paper, which find poses by the field alone, got fast"
+            )
         self._check_unused()
         self._check_shutter()
 
@@ -207,7 +214,7 @@ def _photographs(config: Config) -> tuple[Photographs, Photographs]:
     return train, held_out
 
 
-def _middle(photographs: Photographs) -> float:
+def middle(photographs: Photographs) -> float:
     """Depth of the middle of the scene, where a world that is not known yet has its origin.
 
     Turns on the world's side then go about what the cameras look at. About the cameras themselves, turning
@@ -224,7 +231,7 @@ def _disturbed(config: Config, train: Photographs, extent: float) -> tuple[Float
         return ground_truth, "none: the poses of the data"
     if config.noise == "unknown":
         T_same = np.tile(np.eye(4), (len(ground_truth), 1, 1))
-        T_same[:, 2, 3] = -_middle(train)
+        T_same[:, 2, 3] = -middle(train)
         return T_same, "poses unknown: all start in one place"
     if config.noise == "independent":
         T_noise = pose_noise.independent(len(ground_truth), config.noise_sigma, config.seed)

@@ -25,8 +25,16 @@ from jaxpose.datasets.photos.transforms_json import stated, write_transforms
 from jaxpose.experiments import devices, training_loop
 from jaxpose.experiments.command import MODULE, Command, execute
 from jaxpose.experiments.devices import Job
+from jaxpose.experiments.noisy_nerf import registration
 from jaxpose.experiments.noisy_nerf.evaluation import PROTOCOL, UNPOSED_PROTOCOL, Measured, measure
-from jaxpose.experiments.noisy_nerf.model import Model, build, describe, found_shutter, splined
+from jaxpose.experiments.noisy_nerf.model import (
+    Model,
+    build,
+    describe,
+    found_shutter,
+    initial_state,
+    splined,
+)
 from jaxpose.experiments.noisy_nerf.options import (
     GROUPS,
     ORBIT,
@@ -36,6 +44,7 @@ from jaxpose.experiments.noisy_nerf.options import (
     resume_fingerprint,
     studies,
 )
+from jaxpose.experiments.noisy_nerf.registration import Registered
 from jaxpose.experiments.noisy_nerf.report import describe_step, report, table
 from jaxpose.experiments.outcome import Outcome, read_results
 from jaxpose.experiments.progress import OnUpdate, Update, silent
@@ -45,6 +54,8 @@ from jaxpose.files import atomic, run_folder, trajectories
 from jaxpose.files.camera_json import write_camera
 from jaxpose.plots import nerf as nerf_plots
 from jaxpose.plots.nerf import History
+
+_REGISTRATION = "registration.npz"
 
 
 def run(config: Config, on_update: OnUpdate = silent) -> Outcome:
@@ -82,6 +93,7 @@ def train(
     config: Config,
     problem: Problem,
     model: Model,
+    registered: Registered | None,
     checkpoint: Path,
     job: Job,
     on_update: OnUpdate,
@@ -97,7 +109,7 @@ def train(
 
     return training_loop.train(
         model,
-        training_loop.initial_state(model, config.seed),
+        initial_state(config, problem, model, registered),
         model.views,
         lambda params: training_loop.mean_errors(poses(params), problem.train.T_world_cam),
         checkpoint,
@@ -106,7 +118,7 @@ def train(
         precision=config.precision,
         label=label,
         describe=partial(describe_step, problem.extent),
-        between=between if config.pose == "spline_reset" else None,
+        between=between if config.pose == "spline_reset" else model.between,
     )
 
 
@@ -122,7 +134,11 @@ def load_run(folder: Path | str) -> Loaded[Problem, Model]:
     Raises:
         DataError, OSError: for a folder that holds no such run.
     """
-    return training_loop.load_run(folder, Config, load, build)
+
+    def rebuilt(config: Config, problem: Problem) -> Model:
+        return build(config, problem, _stored(Path(folder), problem))
+
+    return training_loop.load_run(folder, Config, load, rebuilt)
 
 
 def main(args: Sequence[str] | None = None, prog: str = MODULE + "noisy_nerf") -> None:
@@ -145,8 +161,9 @@ def _single(
         training_loop.set_up_run_folder(folder, config, resume_fingerprint(config))
     if devices.from_first(job, job.writes and finished.exists()):
         return read_results(finished, "noisy_nerf") if job.writes else devices.followed(job)
-    model = build(config, problem)
-    trained = train(config, problem, model, checkpoint, job, on_update, label)
+    registered = _registered(config, problem, folder, job, on_update)
+    model = build(config, problem, registered)
+    trained = train(config, problem, model, registered, checkpoint, job, on_update, label)
     devices.leave(job)
     if not job.writes:
         return devices.followed(job)
@@ -163,6 +180,7 @@ def _single(
         trained,
         started,
         data=problem.metadata,
+        registration=registration.summary(problem, registered),
         training=describe(config, model),
         protocol=PROTOCOL if measured.posed else UNPOSED_PROTOCOL,
         shutter=found_shutter(config, model, trained.state.pose),
@@ -170,6 +188,27 @@ def _single(
     )
     atomic.write_json(finished, results)  # last: with it the run counts as finished
     return results
+
+
+def _registered(
+    config: Config, problem: Problem, folder: Path, job: Job, on_update: OnUpdate
+) -> Registered | None:
+    """The registration that a killed run has left, or a new one; None with presets that do without."""
+    if config.preset != "fast" or config.smoke:
+        return None
+    found = _stored(folder, problem)
+    if found is None:
+        found = registration.register(config, problem, on_update)
+        if found is None:
+            on_update(Update("too few features are shared: poses by the colours, as with --preset joint"))
+        elif job.writes:
+            registration.save(folder / _REGISTRATION, found)
+    return found
+
+
+def _stored(folder: Path, problem: Problem) -> Registered | None:
+    stored = folder / _REGISTRATION
+    return registration.load(stored, len(problem.train.t)) if stored.exists() else None
 
 
 def _draw(folder: Path, config: Config, problem: Problem, measured: Measured, trained: Trained) -> None:

@@ -49,6 +49,17 @@ def table(runs: dict[str, dict[str, Any]]) -> str:
     return markdown_table(rows)
 
 
+def _registered(found: dict[str, Any] | None) -> list[str]:
+    """What features alone have found; nothing where they were not asked or too few."""
+    if not found or not found["photographs"]:
+        return []
+    error = "" if found["rotation_error_deg"] is None else f": {found['rotation_error_deg']:.2f} deg"
+    return [
+        f"  features     place {found['photographs']} photographs by {found['points']} points, "
+        f"{found['noise_px']:.2f} px{error}"
+    ]
+
+
 def report(folder: Path, results: dict[str, Any]) -> str:
     """The numbers of a run with their protocol, and where everything is."""
     if "process" in results:
@@ -74,6 +85,7 @@ def report(folder: Path, results: dict[str, Any]) -> str:
         *(f"  note         {note}" for note in data["notes"]),
         f"  noise        {data['noise']}{':' if at_start else ''}",
         *at_start,
+        *_registered(one.get("registration")),
         "",
         table(runs),
         "",

@@ -1,0 +1,107 @@
+"""What photographs share, before anything is trained: poses that agree with it, and where the scene is."""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxpose.evaluation import trajectory_error
+from jaxpose.experiments.noisy_nerf.options import Config, Problem, middle
+from jaxpose.experiments.progress import OnUpdate, Update
+from jaxpose.files import atomic
+from jaxpose.files.schema import FARTHEST_M, numbers, rigid_transforms
+from jaxpose.files.untrusted import read_npz
+from jaxpose.structure import adjust, find_tracks
+
+# [%] of the points along each axis that the scene's core holds: all but strays, where scenes end; else what is
+# near, as what is far is drawn together.
+_CORE = {"depth": (0.5, 99.5), "disparity": (10.0, 90.0)}
+_MARGIN = 1.3  # times the extent of the points, as surfaces without features go on
+_NEARER, _FARTHER = 0.7, 1.3  # times the depths that 98% of observations have
+_WHAT = "the registration of a run"
+
+
+class Registered(NamedTuple):
+    """Poses that agree with what the photographs share, and the scene that they show."""
+
+    T_world_cam: Float[np.ndarray, "n 4 4"]  # where `supported`; else as at the start
+    supported: Bool[np.ndarray, " n"]
+    centre: tuple[float, float, float]  # of the scene's core [scene units]
+    half: tuple[float, float, float]  # of its sides
+    near: float  # depth at which the scene begins [scene units]
+    far: float
+    points: int
+    noise_px: float
+
+
+def register(config: Config, problem: Problem, on_update: OnUpdate) -> Registered | None:
+    """Find poses by features of the photographs alone; None where these share too little."""
+    photographs = problem.train
+    tracks = find_tracks(
+        photographs.rgb,
+        photographs.camera,
+        photographs.mask,
+        lambda what, done, total: on_update(Update(f"matching photographs: {what}", done, total, what)),
+    )
+    error = lambda width, median: on_update(
+        Update("adjusting poses", state={"width": f"{width:.2f} px", "error": f"{median:.2f} px"})
+    )
+    bundle = adjust(tracks, problem.T_start, middle(photographs), error)
+    if bundle is None:
+        return None
+    low, high = np.percentile(bundle.points, _CORE[photographs.spacing], axis=0)
+    near, far = np.percentile(bundle.depth, (1, 99))
+    centre, half = (low + high) / 2, np.maximum(_MARGIN * (high - low) / 2, 1e-2 * (far - near))
+    is_open = photographs.spacing == "disparity"
+    return Registered(
+        problem.T_start if config.noise == "none" else bundle.T_world_cam,
+        bundle.supported,
+        _three(centre),
+        _three(half),
+        _NEARER * near,
+        max(photographs.far, far) if is_open else _FARTHER * far,
+        len(bundle.points),
+        bundle.noise_px,
+    )
+
+
+def summary(problem: Problem, registered: Registered | None) -> dict[str, Any]:
+    """The registration in numbers, for `results.json`."""
+    if registered is None:
+        return {"photographs": 0, "points": 0, "noise_px": None, "rotation_error_deg": None}
+    truth = problem.train.T_world_cam
+    known = np.isfinite(truth).all()
+    error = trajectory_error.pose_errors(registered.T_world_cam, truth).rotation_deg if known else None
+    return {
+        "photographs": int(registered.supported.sum()),
+        "points": registered.points,
+        "noise_px": registered.noise_px,
+        "rotation_error_deg": error,
+    }
+
+
+def save(path: Path, registered: Registered) -> None:
+    """Write a registration to a file that `load` reads."""
+    with atomic.atomic(path) as temporary:
+        np.savez(temporary, **registered._asdict())
+
+
+def load(path: Path, count: int) -> Registered:
+    """Read the registration of so many photographs; DataError for another file."""
+    content = read_npz(path, _WHAT)
+    number = lambda key, shape=(), **limits: numbers(path, content, key, shape, **limits)
+    T = number("T_world_cam", (count, 4, 4))
+    rigid_transforms(path, "T_world_cam", T)
+    supported = number("supported", (count,), least=0, most=1)
+    half = number("half", (3,), above=0, most=FARTHEST_M)
+    near, far = (float(number(key, above=0)) for key in ("near", "far"))
+    centre = number("centre", (3,), least=-FARTHEST_M, most=FARTHEST_M)
+    points = int(number("points", whole=True, least=0))
+    noise_px = float(number("noise_px", least=0))
+    return Registered(T, supported > 0, _three(centre), _three(half), near, far, points, noise_px)
+
+
+def _three(values: Float[np.ndarray, "3"]) -> tuple[float, float, float]:
+    x, y, z = values.tolist()
+    return x, y, z

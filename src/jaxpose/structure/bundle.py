@@ -1,0 +1,314 @@
+"""Bundle adjustment: poses and points that agree with what photographs share, whatever poses one starts from.
+
+Reprojection errors in the robust loss of Geman and McClure (1985), minimised by Levenberg-Marquardt with the
+points eliminated (Schur complement; Triggs et al. 1999). The loss starts as wide as the errors and narrows to
+their noise (graduated non-convexity, Blake and Zisserman 1987), so that wrong matches count less and less.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Bool, Float, Int
+from scipy.sparse.csgraph import connected_components
+
+from jaxpose._checks import check_finite, check_shapes
+from jaxpose.evaluation.trajectory_error import align, procrustes
+from jaxpose.geometry import rigid
+from jaxpose.geometry.rigid import Similarity
+from jaxpose.structure.tracks import Tracks
+
+_OUTLIER = 3.0  # sigmas of reprojection
+_FEWEST = 12  # observations that agree, of a photograph whose pose is believed
+_NARROWER = 3.0  # times the loss, from stage to stage
+_LEAST_NOISE = 0.05  # [px]
+_WIDE = 90  # [%] of the errors at the start, that the loss begins with
+_STEPS, _SETTLED = 15, 1e-3  # of a stage: at most so many, and the share by which its loss has to fall
+_MEDIAN_LENGTH = 1.177  # of a vector in the plane, normal in both directions, in sigmas
+_NEAREST = 1e-2  # of the usual depth, in front of a camera
+_WIDEST = 1e-2  # spread of camera centres, in usual depths, below which they are all in one place
+
+
+class Bundle(NamedTuple):
+    """Poses and points that agree with what photographs share, in the world of the poses it started from."""
+
+    T_world_cam: Float[np.ndarray, "n 4 4"]  # where `supported`; else as at the start
+    supported: Bool[np.ndarray, " n"]  # photographs with enough observations that agree, tied to the others
+    points: Float[np.ndarray, "m 3"]  # those seen by supported photographs
+    depth: Float[np.ndarray, " k"]  # of every observation that agrees, along the optical axis
+    noise_px: float  # sigma of the reprojection errors that agree
+
+
+class _Problem(NamedTuple):
+    """Observations, and who sees what as sparse matrices."""
+
+    view: Int[np.ndarray, " o"]
+    point: Int[np.ndarray, " o"]
+    xy: Float[np.ndarray, "o 2"]
+    focal: float
+    nearest: float  # depth in front of a camera
+    by_view: sp.csr_matrix  # (n, o), sums over the observations of each view
+    by_point: sp.csr_matrix  # (m, o)
+
+
+class _Errors(NamedTuple):
+    """Reprojection errors [px]; infinite behind a camera."""
+
+    point_cam: Float[np.ndarray, "o 3"]
+    residual: Float[np.ndarray, "o 2"]
+    size: Float[np.ndarray, " o"]
+
+
+class _Solution(NamedTuple):
+    T: Float[np.ndarray, "n 4 4"]
+    points: Float[np.ndarray, "m 3"]
+    errors: _Errors
+    sigma: float
+
+
+def adjust(
+    tracks: Tracks,
+    T_start: Float[np.ndarray, "n 4 4"],
+    depth: float,
+    on_step: Callable[[float, float], None] = lambda sigma, error: None,
+) -> Bundle | None:
+    """Find the poses that agree with what photographs share.
+
+    Args:
+        tracks: What they share.
+        T_start: Camera-to-world poses (n, 4, 4) to start from; they may be far off, or all the same.
+        depth: Where points are along the optical axis, as far as it is known: it settles the scale if all
+            poses start in one place.
+        on_step: Called after every stage with the width of the loss and the median error [px].
+
+    Returns:
+        Poses and points; None where fewer than half the photographs share enough.
+
+    Raises:
+        ValueError: For poses of another number or shape, or not finite, and a depth that is not above 0.
+    """
+    check_shapes(T_start=(T_start, f"{tracks.views} 4 4"))
+    check_finite(T_start=T_start)
+    if not depth > 0:
+        raise ValueError(f"depth: expected more than 0, got {depth}")
+    problem = _problem(tracks, _NEAREST * depth)
+    if problem is None:
+        return None
+    found = _solution(problem, np.array(T_start, np.float64), depth, on_step)
+    if not _apart(T_start, depth):
+        # Seen from one place a scene may be turned inside out, cameras on the wrong side of one another.
+        other = _solution(problem, _mirrored(found.T, depth), depth, on_step)
+        found = min(found, other, key=lambda each: np.median(each.errors.size))
+    T, points, errors, sigma = found
+    agree = errors.size < _OUTLIER * sigma
+    supported = np.asarray(problem.by_view @ agree.astype(np.float64)) >= _FEWEST
+    if supported.sum() < max(4, len(T) / 2):
+        return None
+    to_start = _gauge(T[supported], T_start[supported], errors.point_cam[agree, 2], depth)
+    moved = np.where(supported[:, None, None], align(to_start, T), T_start)
+    agree &= supported[problem.view]
+    seen = np.unique(problem.point[agree])
+    place = to_start.scale * points[seen] @ to_start.rotation.T + to_start.translation
+    return Bundle(moved, supported, place, to_start.scale * errors.point_cam[agree, 2], sigma)
+
+
+def _solution(
+    problem: _Problem,
+    T: Float[np.ndarray, "n 4 4"],
+    depth: float,
+    on_step: Callable[[float, float], None],
+) -> _Solution:
+    """Descents of narrower and narrower losses, down to the noise."""
+    points = _start_points(problem, T, depth)
+    size = _reproject(problem, T, points).size
+    size = np.where(np.isfinite(size), size, problem.focal)
+    sigma = max(float(np.percentile(size, _WIDE)), _LEAST_NOISE)
+    while True:
+        T, points, errors = _stage(problem, T, points, sigma)
+        median = float(np.median(errors.size))
+        on_step(sigma, median)
+        narrower = max(sigma / _NARROWER, median / _MEDIAN_LENGTH, _LEAST_NOISE)
+        if narrower > 0.9 * sigma:
+            return _Solution(T, points, errors, sigma)
+        sigma = narrower
+
+
+def _apart(T: Float[np.ndarray, "n 4 4"], depth: float) -> bool:
+    """Whether cameras are in places apart."""
+    centre = T[:, :3, 3]
+    return float(np.linalg.norm(centre - centre.mean(axis=0), axis=1).mean()) > _WIDEST * depth
+
+
+def _mirrored(T: Float[np.ndarray, "n 4 4"], depth: float) -> Float[np.ndarray, "n 4 4"]:
+    """Cameras on the other side of their middle, which see that of the scene where they saw it."""
+    centre, axis = T[:, :3, 3], T[:, :3, 2].mean(axis=0)
+    middle = centre.mean(axis=0)
+    aim = middle + depth * axis / np.linalg.norm(axis)
+    mirrored = 2 * middle - centre
+    before, after = ((aim - c) / np.linalg.norm(aim - c, axis=1, keepdims=True) for c in (centre, mirrored))
+    across = np.cross(before, after)
+    sine = np.linalg.norm(across, axis=1, keepdims=True)
+    angle = np.arctan2(sine, np.sum(before * after, axis=1, keepdims=True))
+    turn = rigid.so3_exp(across / np.maximum(sine, 1e-12) * angle)
+    return rigid.make(turn @ T[:, :3, :3], mirrored)
+
+
+def _problem(tracks: Tracks, nearest: float) -> _Problem | None:
+    """The observations of the most photographs that hang together; None where there are none."""
+    n, m = tracks.views, tracks.points
+    if m == 0:
+        return None
+    one = np.ones(len(tracks.view))
+    seen = sp.coo_matrix((one, (tracks.view, n + tracks.point)), (n + m, n + m))
+    _, group = connected_components(seen, directed=False)
+    kept = group[tracks.view] == np.bincount(group[:n]).argmax()
+    view, (_, point) = tracks.view[kept], np.unique(tracks.point[kept], return_inverse=True)
+    if len(view) == 0:
+        return None
+    rows = np.arange(len(view))
+    by_view = sp.csr_matrix((np.ones(len(view)), (view, rows)), (n, len(view)))
+    by_point = sp.csr_matrix((np.ones(len(view)), (point, rows)), (point.max() + 1, len(view)))
+    return _Problem(view, point, tracks.xy_cam[kept], tracks.focal, nearest, by_view, by_point)
+
+
+def _start_points(problem: _Problem, T: Float[np.ndarray, "n 4 4"], depth: float) -> Float[np.ndarray, "m 3"]:
+    """Where the rays to a point come nearest to each other; in mid-scene if that is not before them all."""
+    ray_cam = np.concatenate([problem.xy, np.ones((len(problem.xy), 1))], axis=1)
+    ray = np.einsum("oij,oj->oi", T[problem.view, :3, :3], ray_cam)
+    origin = T[problem.view, :3, 3]
+    unit = ray / np.linalg.norm(ray, axis=1, keepdims=True)
+    across = np.eye(3) - unit[:, :, None] * unit[:, None]
+    count = np.bincount(problem.point)
+    A = (problem.by_point @ across.reshape(-1, 9)).reshape(-1, 3, 3)
+    b = problem.by_point @ np.einsum("oij,oj->oi", across, origin)
+    near = np.linalg.solve(A + 1e-9 * np.eye(3), b[..., None])[..., 0]
+    middle = problem.by_point @ (origin + depth * ray) / count[:, None]
+    z = np.einsum("oi,oi->o", near[problem.point] - origin, T[problem.view, :3, 2])
+    good = (z > depth / 10) & (z < 10 * depth)
+    all_good = problem.by_point @ (~good).astype(np.float64) == 0
+    return np.where(all_good[:, None], near, middle)
+
+
+def _reproject(problem: _Problem, T: Float[np.ndarray, "n 4 4"], points: Float[np.ndarray, "m 3"]) -> _Errors:
+    away = points[problem.point] - T[problem.view, :3, 3]
+    point_cam = np.einsum("oji,oj->oi", T[problem.view, :3, :3], away)
+    front = point_cam[:, 2] > problem.nearest
+    depth = np.where(front, point_cam[:, 2], 1.0)
+    residual = problem.focal * (point_cam[:, :2] / depth[:, None] - problem.xy)
+    residual[~front] = 0
+    return _Errors(point_cam, residual, np.where(front, np.linalg.norm(residual, axis=1), np.inf))
+
+
+def _loss(errors: _Errors, width: float) -> float:
+    """Geman and McClure's, in squares of the width; 1 behind a camera."""
+    ratio = (np.where(np.isfinite(errors.size), errors.size, 0) / width) ** 2
+    return float(np.where(np.isfinite(errors.size), ratio / (1 + ratio), 1.0).sum())
+
+
+def _stage(
+    problem: _Problem, T: Float[np.ndarray, "n 4 4"], points: Float[np.ndarray, "m 3"], sigma: float
+) -> tuple[Float[np.ndarray, "n 4 4"], Float[np.ndarray, "m 3"], _Errors]:
+    """Levenberg and Marquardt's descent of a loss of one width."""
+    width, damping = _OUTLIER * sigma, 1e-3
+    errors = _reproject(problem, T, points)
+    loss = _loss(errors, width)
+    for _ in range(_STEPS):
+        system = _normal_equations(problem, T, errors, width)
+        while True:
+            twist, shift = _solve(problem, system, damping)
+            moved, placed = T @ rigid.exp(twist), points + shift
+            after = _reproject(problem, moved, placed)
+            lower = _loss(after, width)
+            if lower < loss:
+                break
+            damping *= 8
+            if damping > 1e8:
+                return T, points, errors
+        settled = loss - lower < _SETTLED * loss
+        T, points, errors, loss, damping = moved, placed, after, lower, max(damping / 5, 1e-9)
+        if settled:
+            break
+    return T, points, errors
+
+
+class _System(NamedTuple):
+    """Normal equations in blocks: of the views (increments on the right), of the points, of both."""
+
+    view: Float[np.ndarray, "n 6 6"]
+    point: Float[np.ndarray, "m 3 3"]
+    both: Float[np.ndarray, "o 6 3"]
+    by_view: Float[np.ndarray, "n 6"]
+    by_point: Float[np.ndarray, "m 3"]
+
+
+def _normal_equations(
+    problem: _Problem, T: Float[np.ndarray, "n 4 4"], errors: _Errors, width: float
+) -> _System:
+    front = np.isfinite(errors.size)
+    ratio = (np.where(front, errors.size, 0) / width) ** 2
+    weight = np.where(front, 1 / (1 + ratio) ** 2, 0) / width**2
+    x, y, z = np.where(front[:, None], errors.point_cam, 1.0).T
+    zero = np.zeros_like(z)
+    by_cam = problem.focal * np.stack(
+        [np.stack([1 / z, zero, -x / z**2], -1), np.stack([zero, 1 / z, -y / z**2], -1)], 1
+    )  # of the residual by the point in camera axes
+    by_point = np.einsum("oij,okj->oik", by_cam, T[problem.view, :3, :3])
+    turned = np.cross(by_cam, np.where(front[:, None], errors.point_cam, 1.0)[:, None])
+    by_view = np.concatenate([-by_cam, turned], axis=-1)
+    weighted_view, weighted_point = (weight[:, None, None] * each for each in (by_view, by_point))
+    product = lambda a, b: np.einsum("oki,okj->oij", a, b)
+    down = lambda a: np.einsum("oki,ok->oi", a, errors.residual)
+    total = lambda which, blocks: (which @ blocks.reshape(len(blocks), -1)).reshape(-1, *blocks.shape[1:])
+    return _System(
+        total(problem.by_view, product(weighted_view, by_view)),
+        total(problem.by_point, product(weighted_point, by_point)),
+        product(weighted_view, by_point),
+        total(problem.by_view, down(weighted_view)),
+        total(problem.by_point, down(weighted_point)),
+    )
+
+
+def _solve(
+    problem: _Problem, system: _System, damping: float
+) -> tuple[Float[np.ndarray, "n 6"], Float[np.ndarray, "m 3"]]:
+    """The increments of poses and points, the points eliminated."""
+    n, m = len(system.view), len(system.point)
+    of_view, of_point = (_damped(blocks, damping) for blocks in (system.view, system.point))
+    inverse = np.linalg.inv(of_point)
+    rows = np.broadcast_to(6 * problem.view[:, None, None] + np.arange(6)[:, None], system.both.shape)
+    columns = np.broadcast_to(3 * problem.point[:, None, None] + np.arange(3), system.both.shape)
+    sparse = lambda blocks: sp.csr_matrix((blocks.ravel(), (rows.ravel(), columns.ravel())), (6 * n, 3 * m))
+    both, eliminated = sparse(system.both), sparse(system.both @ inverse[problem.point])
+    reduced = -(eliminated @ both.T).toarray()
+    place = np.arange(n)
+    reduced.reshape(n, 6, n, 6)[place, :, place, :] += of_view
+    twist = -np.linalg.solve(reduced, system.by_view.ravel() - eliminated @ system.by_point.ravel())
+    shift = -np.einsum("mij,mj->mi", inverse, system.by_point + (both.T @ twist).reshape(m, 3))
+    return twist.reshape(n, 6), shift
+
+
+def _damped(blocks: Float[np.ndarray, "k d d"], damping: float) -> Float[np.ndarray, "k d d"]:
+    """Blocks with more on their diagonals; those of nobody's observations are ones."""
+    d = blocks.shape[-1]
+    diagonal = np.einsum("kii->ki", blocks)
+    least = 1e-9 * diagonal.max()
+    damped = blocks.copy()
+    more = damping * np.maximum(diagonal, 1e-3 * diagonal.max(axis=1, keepdims=True)) + max(least, 1e-30)
+    damped[:, np.arange(d), np.arange(d)] += more
+    return damped
+
+
+def _gauge(
+    T: Float[np.ndarray, "n 4 4"],
+    T_start: Float[np.ndarray, "n 4 4"],
+    z: Float[np.ndarray, " k"],
+    depth: float,
+) -> Similarity:
+    """The similarity into the world of the start; what that leaves open is settled by the depth."""
+    if _apart(T_start, depth):
+        return procrustes(T, T_start)
+    centre = T_start[:, :3, 3]
+    scale = depth / float(np.median(z))
+    rotation = rigid.nearest_rotation(np.einsum("nij,nkj->ik", T_start[:, :3, :3], T[:, :3, :3]))
+    return Similarity(scale, rotation, centre.mean(axis=0) - scale * rotation @ T[:, :3, 3].mean(axis=0))
