@@ -14,8 +14,8 @@ from jaxpose.files.schema import FARTHEST_M, numbers, rigid_transforms
 from jaxpose.files.untrusted import read_npz
 from jaxpose.structure import adjust, find_tracks
 
-# [%] of the points along each axis that the scene's core holds: all but strays, where scenes end; else what is
-# near, as what is far is drawn together.
+# [%] of the points along each axis that the scene's core holds: all but strays, where scenes end; else what
+# is near, as what is far is drawn together.
 _CORE = {"depth": (0.5, 99.5), "disparity": (10.0, 90.0)}
 _MARGIN = 1.3  # times the extent of the points, as surfaces without features go on
 _NEARER, _FARTHER = 0.7, 1.3  # times the depths that 98% of observations have
