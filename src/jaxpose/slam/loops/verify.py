@@ -86,7 +86,7 @@ def _compare(camera: Camera) -> Callable[..., Comparison]:
         sigma = jnp.hypot(depth_sigma(pixels.depth), depth_sigma(points[:, 2]))
         agree = there & (jnp.abs(distance) < _AGREE * sigma)
         before = there & (distance > _AGREE * sigma)
-        share = lambda x, of: jnp.sum(x) / jnp.maximum(jnp.sum(of), 1)
+        share = lambda x, of: jnp.mean(x) / jnp.maximum(jnp.mean(of), 1 / of.size)
         return Comparison(
             found.T_world_cam,
             image_information(found),
@@ -100,7 +100,8 @@ def _compare(camera: Camera) -> Callable[..., Comparison]:
 
 
 def _correlation(a: Float[Array, " n"], b: Float[Array, " n"], counts: Array) -> Float[Array, ""]:
-    weight = counts / jnp.maximum(jnp.sum(counts), 1)
+    weight = counts.astype(a.dtype)
+    weight /= jnp.maximum(jnp.sum(weight), 1)
     a, b = (x - jnp.sum(weight * x) for x in (a, b))
     spread = jnp.sqrt(jnp.sum(weight * a**2) * jnp.sum(weight * b**2))
     return jnp.sum(weight * a * b) / jnp.maximum(spread, 1e-6)
