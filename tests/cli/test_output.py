@@ -46,6 +46,8 @@ _IMPORTED = """
 import gc, importlib, signal, sys
 from jaxpose.experiments.command import start
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
+
 def load(name):
     def swallow(phase, info):  # as JAX's callback does
         signal.raise_signal(signal.SIGINT)

@@ -143,7 +143,7 @@ def test_record3d_unpacked_with_a_lost_frame_and_its_own_focus(tmp_path, walk):
         ),
         (
             lambda p, w: phones.record3d(p, w, compress=lambda b: phones.lzfse.compress(b[:8])),
-            "3072 bytes, got 8",
+            "expected LZFSE, got 8 bytes, not 3072",
         ),
         (
             lambda p, w: phones.record3d(p, w, metadata={"dw": 24, "dh": 32}),
