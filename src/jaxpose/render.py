@@ -123,6 +123,23 @@ def sample_depths(
         raise ValueError(f"spacing: expected 'depth' or 'disparity', got {spacing!r}")
     within = jnp.full(samples, 0.5) if key is None else jax.random.uniform(key, (samples,))
     share = (jnp.arange(samples, dtype=within.dtype) + within) / samples
+    return depth_at(share, near, far, spacing)
+
+
+def depth_at(
+    share: Float[Array, " s"], near: float | Float[Array, ""], far: float | Float[Array, ""], spacing: Spacing
+) -> Float[Array, " s"]:
+    """Depths at shares of the way from the first to the last, in depth or in disparity.
+
+    Args:
+        share: From 0 to 1.
+        near: The first depth, above 0 in disparity.
+        far: The last depth; in disparity it may be infinite.
+        spacing: What shares are equal in.
+
+    Returns:
+        Depths in the unit of `near` and `far`.
+    """
     if spacing == "depth":
         return near + (far - near) * share
     return 1 / jnp.maximum((1 - share) / near + share / far, 1e-8)

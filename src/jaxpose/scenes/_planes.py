@@ -69,17 +69,11 @@ def planes(config: PlanesConfig) -> SceneField:
     def init(key: PRNGKeyArray) -> Params:
         plane_key, line_key, hidden_key, colour_key = jax.random.split(key, 4)
         draw = lambda key, *shape: _START * jax.random.normal(key, shape)
-        n = config.nodes >> (config.levels - 1)
-        grids = {
-            "plane_0": draw(plane_key, 3, n, n, ranks),
-            "line_0": draw(line_key, 3, n, ranks) + 3 * _START,
-        }
-        for level in range(1, config.levels):
-            n = config.nodes >> (config.levels - 1 - level)
-            grids |= {
-                f"plane_{level}": jnp.zeros((3, n, n, ranks)),
-                f"line_{level}": jnp.zeros((3, n, ranks)),
-            }
+        sizes = [config.nodes >> (config.levels - 1 - level) for level in range(config.levels)]
+        grids = {f"plane_{k}": jnp.zeros((3, n, n, ranks)) for k, n in enumerate(sizes)}
+        grids |= {f"line_{k}": jnp.zeros((3, n, ranks)) for k, n in enumerate(sizes)}
+        grids["plane_0"] = draw(plane_key, *grids["plane_0"].shape)
+        grids["line_0"] = draw(line_key, *grids["line_0"].shape) + 3 * _START
         inputs, width = 3 * config.colour_rank + 3, config.colour_width
         return {
             "grids": grids,
@@ -95,7 +89,7 @@ def planes(config: PlanesConfig) -> SceneField:
 
     def query(params, point, direction):
         plane, line = _combined(config, params)
-        found = _products(config, plane, line, point)
+        found = _at_node(plane, line, _node(config, point))  # (3, r)
         density = _density(config, found)
         along = direction / jnp.sqrt(jnp.sum(direction**2) + jnp.finfo(direction.dtype).tiny)
         features = jnp.concatenate([found[:, config.density_rank :].reshape(-1), along])
@@ -170,14 +164,10 @@ def _node(config: PlanesConfig, point: Float[Array, "*n 3"]) -> Float[Array, "*n
     return (drawn / (1 + _AROUND) + 1) / 2 * (config.nodes - 1)
 
 
-def _products(config, plane, line, point):
-    """Each plane's values times its line's at a point of the world (3, r)."""
-    return _at_node(plane, line, _node(config, point))
-
-
 def _at_node(
     plane: Float[Array, "3 n n r"], line: Float[Array, "3 n r"], node: Float[Array, "3"]
 ) -> Float[Array, "3 r"]:
+    """Each plane's values times its line's."""
     n, ranks = plane.shape[1], plane.shape[-1]
     low = jnp.clip(jnp.floor(jax.lax.stop_gradient(node)).astype(jnp.int32), 0, n - 2)
     share = node - low.astype(node.dtype)

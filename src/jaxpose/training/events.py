@@ -19,7 +19,7 @@ from jaxpose.fields import PoseField
 from jaxpose.geometry.camera import Camera
 from jaxpose.render import pixel_ray
 from jaxpose.scenes import SceneField
-from jaxpose.training.photometric import Depths, ray_colour, stratified
+from jaxpose.training.photometric import Depths, draw_samples, ray_colour, stratified
 from jaxpose.training.steps import Trainer, joint, microbatched_sum
 
 Loss = Literal["window", "asynchronous"]
@@ -117,8 +117,7 @@ def trainer(
         pixel = jnp.stack([pairs.pixel % camera.width, pairs.pixel // camera.width], axis=-1)
         pixel = pixel.astype(T_now.dtype)
         rays = [jax.vmap(partial(pixel_ray, camera))(T, pixel) for T in (T_now, T_before)]
-        keys = jax.random.split(depth_key, config.events)
-        samples = jax.vmap(sample, (None, None, 0))(scene_params, None, keys)
+        samples = draw_samples(sample, scene_params, rays[0], depth_key)
         change = config.threshold * pairs.change.astype(pixel.dtype)
         mask = data.mask[pairs.pixel] * pairs.weight[:, None]
         return total(scene_params, (*rays, samples, change, mask)) / (3 * config.events)

@@ -58,7 +58,7 @@ class Views(NamedTuple):
 class Sampler(Protocol):
     """Where a ray of a scene is looked at: drawn with a key, always the same without."""
 
-    def __call__(self, scene_params: Params, ray: Ray | None, key: PRNGKeyArray | None, /) -> Samples: ...
+    def __call__(self, scene_params: Params, ray: Ray, key: PRNGKeyArray | None, /) -> Samples: ...
 
 
 def trainer(
@@ -114,7 +114,7 @@ def trainer(
             rays = jax.vmap(jax.vmap(from_pixel, (0, None)))(times(views.t[view], at[:, 1]), at)
         batch = (
             rays,
-            _samples(sample, scene_params, rays, depth_key),
+            draw_samples(sample, scene_params, rays, depth_key),
             _unit(views.rgb[view, pixel[:, 1], pixel[:, 0]]),
             _weights(views.mask, (view, pixel[:, 1], pixel[:, 0]), at.dtype),
         )
@@ -227,7 +227,7 @@ def _refiner(
             rays = jax.vmap(partial(pixel_ray, camera, moved))(pixel.astype(moved.dtype))
             batch = (
                 rays,
-                _samples(sample, scene_params, rays, depth_key),
+                draw_samples(sample, scene_params, rays, depth_key),
                 _unit(rgb[pixel[:, 1], pixel[:, 0]]),
                 _weights(mask, (pixel[:, 1], pixel[:, 0]), moved.dtype),
             )
@@ -300,7 +300,7 @@ def stratified(depths: Depths, samples: int) -> Sampler:
         The sampler; it looks at neither scene nor ray.
     """
 
-    def sample(scene_params: Params, ray: Ray | None, key: PRNGKeyArray | None) -> Samples:
+    def sample(scene_params: Params, ray: Ray, key: PRNGKeyArray | None) -> Samples:
         del scene_params, ray
         found = render.sample_depths(key, depths.near, depths.far, samples, spacing=depths.spacing)
         return render.to_next(found)
@@ -329,14 +329,10 @@ def importance(
     Returns:
         The sampler, of `samples` + 1 depths.
     """
-    share = jnp.linspace(0.0, 1.0, coarse + 1)
-    edges = depths.near + (depths.far - depths.near) * share
-    if depths.spacing == "disparity":
-        edges = 1 / jnp.maximum((1 - share) / depths.near + share / depths.far, 1e-8)
+    edges = render.depth_at(jnp.linspace(0.0, 1.0, coarse + 1), *depths)
     middle, width = (edges[1:] + edges[:-1]) / 2, jnp.diff(edges)
 
-    def sample(scene_params: Params, ray: Ray | None, key: PRNGKeyArray | None) -> Samples:
-        assert ray is not None
+    def sample(scene_params: Params, ray: Ray, key: PRNGKeyArray | None) -> Samples:
         points = ray.origin[None] + middle[:, None] * ray.direction[None]
         found = jax.vmap(density, (None, 0))(scene_params, points)
         weight = jnp.minimum(found * width * jnp.linalg.norm(ray.direction), _OPAQUE) + _CLEAR
@@ -351,8 +347,18 @@ def importance(
     return sample
 
 
-def _samples(sampler: Sampler, scene_params: Params, rays: Ray, key: PRNGKeyArray) -> Samples:
-    """Those of many rays, drawn for each anew; rays of one exposure share those of the middle one."""
+def draw_samples(sampler: Sampler, scene_params: Params, rays: Ray, key: PRNGKeyArray) -> Samples:
+    """Samples of many rays, drawn anew for each.
+
+    Args:
+        sampler: Where a ray is looked at.
+        scene_params: Parameters of the scene.
+        rays: (n, 3), or (n, k, 3) of k instants of an exposure, which share the samples of the middle one.
+        key: A random key.
+
+    Returns:
+        (n, s).
+    """
     if rays.origin.ndim == 3:
         rays = jax.tree.map(lambda x: x[:, x.shape[1] // 2], rays)
     keys = jax.random.split(key, len(rays.origin))
