@@ -63,13 +63,12 @@ def seen_shares(
     Poses may be off: points count up to a quarter of the image beside it, and a tenth behind what was
     measured (`coarse_depth`).
     """
-    points_cam = rigid.apply(rigid.inverse(T_world_cam)[:, None], points_world)
-    u, v = np.moveaxis(project_numpy(camera, points_cam), -1, 0)
+    z, u, v = _in_views(points_world, T_world_cam, camera)
     u, v = (u + 0.5) / camera.width, (v + 0.5) / camera.height
-    inside = (points_cam[..., 2] > 0) & (np.abs(u - 0.5) < 0.75) & (np.abs(v - 0.5) < 0.75)
+    inside = (z > 0) & (np.abs(u - 0.5) < 0.75) & (np.abs(v - 0.5) < 0.75)
     row, column = (np.clip(n * np.where(inside, x, 0), 0, n - 1).astype(int) for n, x in ((12, v), (16, u)))
     farthest = depth[np.arange(len(depth))[:, None], row, column]
-    return np.mean(inside & (points_cam[..., 2] < 1.1 * farthest), axis=1)
+    return np.mean(inside & (z < 1.1 * farthest), axis=1)
 
 
 def unlikeness(thumbnails: Float[np.ndarray, "k 2 12 16"], frame: Frame) -> Float[np.ndarray, " k"]:
@@ -90,10 +89,18 @@ def overlap(
     A point counts that is at least `margin` pixels inside the image, and nearer than `farthest` [m]: what is
     behind a wall of the next room is in a camera's view too.
     """
+    z, u, v = _in_views(points_world, T_world_cam, camera)
+    inside = (u >= margin) & (u < camera.width - margin) & (v >= margin) & (v < camera.height - margin)
+    return np.mean(inside & (z < farthest), axis=1)
+
+
+def _in_views(
+    points_world: Float[np.ndarray, "n 3"], T_world_cam: Float[np.ndarray, "k 4 4"], camera: Camera
+) -> tuple[Float[np.ndarray, "k n"], Float[np.ndarray, "k n"], Float[np.ndarray, "k n"]]:
+    """Depth [m] of world points along each camera's axis, and their column and row [px]."""
     points_cam = rigid.apply(rigid.inverse(T_world_cam)[:, None], points_world)
     u, v = np.moveaxis(project_numpy(camera, points_cam), -1, 0)
-    inside = (u >= margin) & (u < camera.width - margin) & (v >= margin) & (v < camera.height - margin)
-    return np.mean(inside & (points_cam[..., 2] < farthest), axis=1)
+    return points_cam[..., 2], u, v
 
 
 def choose(shares: np.ndarray, count: int, generator: np.random.Generator) -> list[int]:

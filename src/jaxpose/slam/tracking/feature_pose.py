@@ -4,6 +4,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxpose.datasets.types import Frame
+from jaxpose.estimate.pose_graph import CHI2_999
 from jaxpose.geometry import rigid
 from jaxpose.slam.keyframes import unlikeness
 from jaxpose.slam.tracking.features import FeaturePose, Features, locate_camera
@@ -18,7 +19,7 @@ _GO_TOGETHER = 10.0
 _ENOUGH = 60  # features of keyframes: with fewer those of the last frame are taken too, which drift
 _MATCHED = 3  # images that a frame's features are matched with
 FIRST_SCALE = 30.0  # of the covariance of poses by features, before any has been compared: measured 6 to 200
-_CHI2_MEDIAN, _CHI2_999 = 5.35, 22.46  # of 6 degrees of freedom
+_CHI2_MEDIAN = 5.35  # of 6 degrees of freedom
 
 
 def seen_pose(
@@ -93,7 +94,7 @@ def with_features(
         apart = rigid.log(rigid.inverse(seen.T_world_cam) @ T_world_predicted)
         both = seen.covariance + predicted.covariance
         expected = np.linalg.inv(predicted.covariance)
-        if apart @ np.linalg.solve(both, apart) > _CHI2_999:
+        if apart @ np.linalg.solve(both, apart) > CHI2_999:
             expected = np.zeros((6, 6))
         share = np.linalg.solve(_GO_TOGETHER * support + expected, expected)
         fused = seen.T_world_cam @ rigid.exp(share @ apart) @ rigid.inverse(T_body_cam)
