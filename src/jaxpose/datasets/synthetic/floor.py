@@ -41,14 +41,7 @@ def _course(angle: Float[Array, ""]) -> Float[Array, "3"]:
 
 def furnish(rng: np.random.Generator) -> list[Piece]:
     """All pieces; the layout is fixed but for small turns, tints come from `rng` too."""
-    tint = lambda *colour: tuple(np.clip(np.multiply(colour, rng.uniform(0.85, 1.15, 3)), 0.05, 0.95))
-    turned = lambda spread: float(rng.uniform(-spread, spread))
-    oak, dark = (partial(textures.wood, colour=tint(*c)) for c in ((0.74, 0.54, 0.34), (0.42, 0.28, 0.18)))
-    metal = partial(textures.plain, colour=(0.36, 0.37, 0.4))
-    leaf = partial(
-        textures.stains, colours=((0.14, 0.32, 0.1), (0.27, 0.52, 0.18), (0.5, 0.7, 0.3)), wavelength=0.05
-    )
-    ball = partial(textures.tiles, colours=((0.9, 0.9, 0.9), (0.8, 0.2, 0.2)), cell=0.12)
+    tint, turned, oak, dark, metal, leaf, ball = furniture.palette(rng, 0.15)
     tin = partial(textures.stains, colours=(tint(0.3, 0.5, 0.6), tint(0.8, 0.7, 0.5)))
     cloth = lambda: partial(textures.fabric, colour=tint(*rng.uniform(0.25, 0.7, 3)))
     stand = lambda pieces, x, y, yaw=0.0: place(pieces, x, y, yaw + turned(0.1))

@@ -3,8 +3,9 @@
 A larger room has the same things, those by a wall moved outwards with it.
 """
 
+from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -231,20 +232,46 @@ def shell(tint, size: Extent, lights: tuple[tuple[float, float, float], ...] = L
     return Piece("room", (0.0, 0.0, half[2]), half, 0.0, painters)
 
 
+class Palette(NamedTuple):
+    """What pieces are made of."""
+
+    tint: Callable[..., Any]  # a colour, slightly another each time
+    turned: Callable[[float], float]  # a random angle [rad] of up to so much
+    oak: Painter
+    dark: Painter
+    metal: Painter
+    leaf: Painter
+    ball: Painter
+
+
+def palette(rng: np.random.Generator, spread: float) -> Palette:
+    """What rooms are furnished from; colours are tinted by up to a share `spread`."""
+    tint = lambda *colour: tuple(
+        np.clip(np.multiply(colour, rng.uniform(1 - spread, 1 + spread, 3)), 0.05, 0.95)
+    )
+    oak, dark = (partial(textures.wood, colour=tint(*c)) for c in ((0.74, 0.54, 0.34), (0.42, 0.28, 0.18)))
+    return Palette(
+        tint,
+        lambda most: float(rng.uniform(-most, most)),
+        oak,
+        dark,
+        partial(textures.plain, colour=(0.36, 0.37, 0.4)),
+        partial(
+            textures.stains,
+            colours=((0.14, 0.32, 0.1), (0.27, 0.52, 0.18), (0.5, 0.7, 0.3)),
+            wavelength=0.05,
+        ),
+        partial(textures.tiles, colours=((0.9, 0.9, 0.9), (0.8, 0.2, 0.2)), cell=0.12),
+    )
+
+
 def furnish(rng: np.random.Generator, size: Extent = SIZE) -> list[Piece]:
     """All pieces; the layout is fixed but for small turns, tints come from `rng` too."""
-    tint = lambda *colour: tuple(np.clip(np.multiply(colour, rng.uniform(0.9, 1.1, 3)), 0.05, 0.95))
-    turned = lambda spread: float(rng.uniform(-spread, spread))
-    oak, dark = (partial(textures.wood, colour=tint(*c)) for c in ((0.74, 0.54, 0.34), (0.42, 0.28, 0.18)))
-    metal = partial(textures.plain, colour=(0.36, 0.37, 0.4))
-    leaf = partial(
-        textures.stains, colours=((0.14, 0.32, 0.1), (0.27, 0.52, 0.18), (0.5, 0.7, 0.3)), wavelength=0.05
-    )
+    tint, turned, oak, dark, metal, leaf, ball = palette(rng, 0.1)
     cloth = partial(textures.fabric, colour=tint(0.35, 0.48, 0.6))
     cushions = [
         partial(textures.fabric, colour=tint(0.85, 0.6, 0.3), stripes=stripes) for stripes in (True, False)
     ]
-    ball = partial(textures.tiles, colours=((0.9, 0.9, 0.9), (0.8, 0.2, 0.2)), cell=0.12)
     tin = partial(textures.stains, colours=((0.2, 0.4, 0.65), (0.85, 0.8, 0.6)), wavelength=0.12)
 
     def outwards(x, y):
