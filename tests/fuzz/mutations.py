@@ -169,12 +169,28 @@ def npy(random: Random, content: bytes) -> bytes:
     return _header(random, content)
 
 
-def npz(random: Random, content: bytes) -> bytes:
-    """Arrays replaced, left out, renamed, with headers that lie; pickled, stored or deflated."""
+def _members(content: bytes) -> dict[str, bytes] | None:
+    """The files of an archive by their names; None for one that is damaged already."""
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            members = {name: archive.read(name) for name in archive.namelist()}
-    except Exception:  # damaged already
+            return {name: archive.read(name) for name in archive.namelist()}
+    except Exception:
+        return None
+
+
+def _archive(random: Random, members: dict[str, bytes], compression: int) -> bytes:
+    """An archive of files, itself damaged now and then."""
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", compression) as archive:
+        for name, value in members.items():
+            archive.writestr(name, value)
+    return stream.getvalue() if random.random() < 0.9 else anywhere(random, stream.getvalue())
+
+
+def npz(random: Random, content: bytes) -> bytes:
+    """Arrays replaced, left out, renamed, with headers that lie; pickled, stored or deflated."""
+    members = _members(content)
+    if members is None:
         return anywhere(random, content)
     for _ in range(random.choice((1, 1, 2))):
         if not members:
@@ -195,11 +211,7 @@ def npz(random: Random, content: bytes) -> bytes:
                 members[name] = stream.getvalue()
             case _:
                 members[name] = npy(random, members[name])
-    stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w", random.choice((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED))) as archive:
-        for name, value in members.items():
-            archive.writestr(name, value)
-    return stream.getvalue() if random.random() < 0.9 else anywhere(random, stream.getvalue())
+    return _archive(random, members, random.choice((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)))
 
 
 def hdf5(random: Random, content: bytes) -> bytes:
@@ -231,10 +243,8 @@ def hdf5(random: Random, content: bytes) -> bytes:
 
 def zipped(random: Random, content: bytes) -> bytes:
     """Members of an archive damaged, left out, renamed."""
-    try:
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            members = {name: archive.read(name) for name in archive.namelist()}
-    except Exception:  # damaged already
+    members = _members(content)
+    if members is None:
         return anywhere(random, content)
     name = random.choice(list(members)) if random.random() < 0.5 else min(members)
     match random.randrange(6):
@@ -246,11 +256,7 @@ def zipped(random: Random, content: bytes) -> bytes:
             members[name] = members[random.choice(list(members))]
         case _:
             members[name] = (tree if members[name].startswith(b"{") else anywhere)(random, members[name])
-    stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w") as archive:
-        for name, value in members.items():
-            archive.writestr(name, value)
-    return stream.getvalue() if random.random() < 0.9 else anywhere(random, stream.getvalue())
+    return _archive(random, members, zipfile.ZIP_STORED)
 
 
 def _header(random: Random, content: bytes) -> bytes:
