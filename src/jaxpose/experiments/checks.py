@@ -16,10 +16,11 @@ RUN_FILES = (
     "field.npz",
     "map.npz",
     "checkpoint.npz",
+    "registration.npz",
     "points.ply",
     "mesh.ply",
 )
-RUN_FILES += tuple(f"{name}.json" for name in ("camera", "settings", "config", "results")) + ("points.ply",)
+RUN_FILES += tuple(f"{name}.json" for name in ("camera", "settings", "config", "results"))
 
 
 def option_name(path: str) -> str:

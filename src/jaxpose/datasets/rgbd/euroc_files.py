@@ -29,6 +29,7 @@ def sensors(path: Path | str) -> Path:
 
 
 def existing(file: Path) -> Path:
+    """The file itself; DataError where there is none."""
     if not file.is_file():
         raise DataError(f"{file}: expected a file, got none")
     return file

@@ -22,10 +22,8 @@ from jaxpose.experiments.planar.warps import Warps, coordinates
 
 STEPS, LAST_STEPS = 6, 4  # on each level with a blur, on the last
 _WIDEST = 2 / 15  # standard deviation of the widest blur, as a share of a patch's side
-_NEAR_PX, _NARROWEST_PX = (
-    6.5,
-    2.0,
-)  # of blurs: see below; the narrowest, before the last level, which has none
+_NEAR_PX = 6.5  # of a blur, from which the next is half as wide
+_NARROWEST_PX = 2.0  # of a blur; the last level has none
 _RIDGE = 1e-3  # in points, that pulls every pixel of the grid to the mean: it decides where no patch lies
 _DAMPING = 1e-6  # of the mean eigenvalue of the normal equations in the field's parameters
 _SWEEPS, _STEP_SWEEPS, _PICTURE_SWEEPS = 20, 5, 60  # of conjugate gradients: image, warps' step, last image
