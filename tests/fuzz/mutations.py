@@ -146,7 +146,7 @@ def array(random: Random, value: np.ndarray) -> np.ndarray:
             return np.concatenate([value] * random.choice((2, 3)))
         case 4 if value.dtype.kind in "iuf" and value.size:
             with np.errstate(all="ignore"):
-                return value * value.dtype.type(random.choice((0, -1, 2)))
+                return value * np.asarray(random.choice((0, -1, 2))).astype(value.dtype)
     if value.size and value.dtype.kind in "iufb":
         flat = value.reshape(-1)
         bad = random.choice((np.nan, np.inf, -np.inf, 0, -1, 1, 1e9, 1e18, 1e200, -1e300, 255, 65535, 0.5))

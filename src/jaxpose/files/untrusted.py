@@ -242,8 +242,26 @@ def read_json(path: Path | str, wanted: str) -> dict[str, Any]:
     """
     path = Path(path)
     with reading(path, wanted):
+        return json_object(_text(path, _TEXT_BYTES), path, wanted)
+
+
+def json_object(text: str | bytes, path: Path | str, wanted: str) -> dict[str, Any]:
+    """The object in a JSON text, of a file or of an entry of one.
+
+    Args:
+        text: the text.
+        path: the file, and the entry where it is one.
+        wanted: what it was expected to be, in words.
+
+    Returns:
+        Its entries.
+
+    Raises:
+        DataError: naming `path`, and the line where it breaks off, for what is not that.
+    """
+    with reading(path, wanted):
         try:
-            content = json.loads(_text(path, _TEXT_BYTES))
+            content = json.loads(text)
         except json.JSONDecodeError as error:
             raise DataError(f"{path}:{error.lineno}: expected {wanted}, got {error.msg}") from None
         if not isinstance(content, dict):

@@ -141,6 +141,12 @@ def test_size_of_the_sensor(tmp_path, size):
     "name, content, message",
     [
         ("a.raw", b"% evt 4.0\n% end\n", "a.raw: expected a header with evt 2.0, 2.1 or 3.0, got evt 4.0"),
+        (
+            "a.raw",
+            b"% evt 2.0\n% geometry " + b"9" * 5000 + b"x480\n% end\n",
+            "a.raw: expected width and height of a sensor, got 99999999999999999999 x 480",
+        ),
+        ("a.csv", b"%geometry:0,480\n1,1,0,5\n", "a.csv: expected width and height of a sensor, got 0 x 480"),
         ("a.raw", b"", "a.raw: expected a header with evt 2.0, 2.1 or 3.0, got none"),
         ("a.raw", HEADERS["evt3"], "a.raw: expected events, got none"),
         ("a.raw", b"%" * 70000, "a.raw: expected a header of lines that begin with %"),

@@ -133,6 +133,11 @@ def test_record3d_unpacked_with_a_lost_frame_and_its_own_focus(tmp_path, walk):
     assert "1 frames left out, without colour or depth: 3" in recording.notes
 
 
+def only_metadata(path, content):
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("metadata", content)
+
+
 @pytest.mark.parametrize(
     "spoil, message",
     [
@@ -152,6 +157,7 @@ def test_record3d_unpacked_with_a_lost_frame_and_its_own_focus(tmp_path, walk):
         (lambda p, w: phones.record3d(p, w, metadata={"K": [1]}), "a.r3d: K: expected 9 finite numbers"),
         (lambda p, w: phones.record3d(p, w, metadata={"poses": "x"}), "a.r3d: poses: expected"),
         (lambda p, w: zipfile.ZipFile(p, "w").close(), "a.r3d: metadata: expected an entry"),
+        (lambda p, w: only_metadata(p, b"[" * 100_000), "a.r3d: metadata: .*got nesting without end"),
     ],
 )
 def test_unusable_archives_are_one_line(tmp_path, walk, spoil, message):

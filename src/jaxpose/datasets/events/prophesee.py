@@ -8,7 +8,7 @@ from typing import BinaryIO
 import numpy as np
 
 from jaxpose.datasets.events.evt import Evt2, Evt3, Evt21, Evt21Swapped
-from jaxpose.datasets.events.stream import BLOCK, Block, Stream
+from jaxpose.datasets.events.stream import BLOCK, Block, Stream, stated_size
 from jaxpose.errors import DataError
 
 _Decoder = Evt2 | Evt3
@@ -41,14 +41,14 @@ def raw_stream(file: Path) -> Stream:
         return (f"{count} events left out, before the first time or row of the file",) if count else ()
 
     return Stream(
-        file, blocks, lambda row: f"{file}: event {row}", "us", _size(header), notes, unit_is_sure=True
+        file, blocks, lambda row: f"{file}: event {row}", "us", _size(file, header), notes, unit_is_sure=True
     )
 
 
 def dat_stream(file: Path) -> Stream:
     """The events of a DAT file; its timestamps of 32 bits turn over every 72 minutes, which is undone."""
     with file.open("rb") as stream:
-        size = _size(_header(file, stream))
+        size = _size(file, _header(file, stream))
         _dat_type(file, stream)
 
     def blocks() -> Iterator[Block]:
@@ -83,13 +83,13 @@ def _header(file: Path, stream: BinaryIO) -> str:
             return "\n".join(lines)
 
 
-def _size(header: str) -> tuple[int, int] | None:
+def _size(file: Path, header: str) -> tuple[int, int] | None:
     """Width and height where a header states them."""
     found = re.search(r"^geometry:? *(\d+) *x *(\d+)", header, re.M | re.I)
     if found:
-        return int(found[1]), int(found[2])
+        return stated_size(file, found[1], found[2])
     sides = [re.search(rf"\b{name}[=: ] *(\d+)", header, re.I) for name in ("width", "height")]
-    return (int(sides[0][1]), int(sides[1][1])) if sides[0] and sides[1] else None
+    return stated_size(file, sides[0][1], sides[1][1]) if sides[0] and sides[1] else None
 
 
 def _decoder(file: Path, header: str, stream: BinaryIO) -> type[_Decoder]:

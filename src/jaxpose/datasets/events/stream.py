@@ -16,6 +16,7 @@ BLOCK = 1 << 17  # events that are held in the file's own types at a time
 _PER_SECOND: dict[Unit, float] = {"s": 1.0, "us": 1e6, "ns": 1e9, "frames": 1.0}
 _RATES_HZ = (1e2, 1e10)  # of events, that a stated unit has to give
 _FEWEST = 100  # events that tell a rate, or that are whole thousands by no chance
+_SIDE_DIGITS = 5  # of the width of a sensor, at most
 
 
 class Block(NamedTuple):
@@ -92,6 +93,13 @@ def count(stream: Stream, size: tuple[int, int], *, most: int) -> StreamStats:
     if stats is None:
         raise DataError(f"{stream.file}: expected events, got none")
     return stats
+
+
+def stated_size(file: Path, width: str, height: str) -> tuple[int, int]:
+    """Width and height of the sensor, of which a file of events has the digits."""
+    if len(width) > _SIDE_DIGITS or len(height) > _SIDE_DIGITS or not int(width) or not int(height):
+        raise DataError(f"{file}: expected width and height of a sensor, got {width[:20]} x {height[:20]}")
+    return int(width), int(height)
 
 
 def inside(block: Block, size: tuple[int, int]) -> Bool[np.ndarray, " n"]:

@@ -8,7 +8,7 @@ from typing import NamedTuple, NoReturn
 
 import numpy as np
 
-from jaxpose.datasets.events.stream import BLOCK, Block, Stream, Unit
+from jaxpose.datasets.events.stream import BLOCK, Block, Stream, Unit, stated_size
 from jaxpose.errors import DataError
 
 _COLUMNS = "4 numbers (t x y p)"
@@ -75,7 +75,7 @@ def _form(file: Path) -> _Form:
             text = line.strip()[:_LONGEST]
             comment = text[:1] in ("#", "%")
             if found := re.match(r"[#%] *geometry *[:=]? *(\d+) *[,x] *(\d+)", text, re.I):
-                size = int(found[1]), int(found[2])
+                size = stated_size(file, found[1], found[2])
             mark = _separator(text)
             words = _split(text.lstrip("#% "), mark)
             if not comment and _numbers(words):

@@ -19,12 +19,12 @@ from jaxpose.datasets.rgbd.phones import UNSURE, Y_UP, middle, sure
 from jaxpose.datasets.types import Recording
 from jaxpose.errors import DataError
 from jaxpose.files.schema import numbers
-from jaxpose.files.untrusted import read_json
+from jaxpose.files.untrusted import json_object, read_json, reading
 from jaxpose.geometry import rigid
 from jaxpose.geometry.camera import Camera, resized
 
 EXTRA = 'pip install -e ".[phone]"'
-_ENTRY = re.compile(r"rgbd/(\d+)\.(jpg|depth|conf)")
+_ENTRY = re.compile(r"rgbd/(\d{1,18})\.(jpg|depth|conf)")
 _MOST_BYTES = 1 << 28  # of an entry
 
 
@@ -109,42 +109,25 @@ def _open(path: Path) -> _Source:
         return _Source(path, names, read, read_json(path / "metadata", "the metadata of Record3D"))
     if not path.is_file():
         raise DataError(f"{path}: expected an archive of Record3D, got {found(path)}")
-    try:
+    with reading(path, "an archive of Record3D (a zip)"):
         archive = zipfile.ZipFile(path)
         names = archive.namelist()
-    except (zipfile.BadZipFile, OSError, ValueError) as error:
-        raise DataError(f"{path}: expected an archive of Record3D (a zip), got {error}") from None
 
     def read(name: str) -> bytes:
-        try:
+        with reading(f"{path}: {name}", "an entry that can be read"):
             if archive.getinfo(name).file_size > _MOST_BYTES:
                 raise ValueError(f"{archive.getinfo(name).file_size} bytes")
             return archive.read(name)
-        except Exception as error:  # of many kinds, for damaged and for encrypted archives
-            words = " ".join(str(error).split()) or type(error).__name__
-            raise DataError(
-                f"{path}: {name}: expected an entry that can be read, got {words[:200]}"
-            ) from None
 
-    import json
-
-    try:
-        content = json.loads(read("metadata"))
-        if not isinstance(content, dict):
-            raise ValueError(f"{str(content)[:40]!r}")
-    except ValueError as error:
-        raise DataError(f"{path}: metadata: expected an object in JSON, got {error}") from None
-    return _Source(path, names, read, content)
+    return _Source(
+        path, names, read, json_object(read("metadata"), f"{path}: metadata", "metadata of Record3D")
+    )
 
 
 def _decode(source: _Source, name: str) -> Image.Image:
     data = source.read(name)
-    try:
-        with Image.open(io.BytesIO(data)) as image:
-            return image.convert("RGB")
-    except Exception as error:  # Pillow raises many kinds on damaged images
-        words = " ".join(str(error).split()) or type(error).__name__
-        raise DataError(f"{source.path}: {name}: expected an image, got {words[:200]}") from None
+    with reading(f"{source.path}: {name}", "an image"), Image.open(io.BytesIO(data)) as image:
+        return image.convert("RGB")
 
 
 def _color(source: _Source, name: str, to: tuple[int, int] | None) -> np.ndarray:
@@ -169,12 +152,10 @@ def _plane(source: _Source, name: str, kind: np.dtype, shape: tuple[int, int]) -
             import lzfse
         except ImportError:
             raise DataError(f"{source.path}: compressed depth needs the package lzfse: {EXTRA}") from None
-        try:
+        with reading(f"{source.path}: {name}", "LZFSE"):
             if (there := _unpacked_size(data)) != size:  # the package allots whatever a damaged one fills
                 raise ValueError(f"{there} bytes, not {size}")
             data = lzfse.decompress(data)
-        except Exception as error:
-            raise DataError(f"{source.path}: {name}: expected LZFSE, got {error}") from None
     if len(data) != size:
         wanted = f"{shape[1]}x{shape[0]} of {kind.name}, {size} bytes"
         raise DataError(f"{source.path}: {name}: expected {wanted}, got {len(data)}")
