@@ -124,7 +124,7 @@ def align(alignment: Similarity, T_ref_cam: Float[np.ndarray, "n 4 4"]) -> Float
     check_shapes(T_ref_cam=(T_ref_cam, "n 4 4"))
     aligned = np.array(T_ref_cam, np.float64)
     aligned[:, :3, :3] = alignment.rotation @ T_ref_cam[:, :3, :3]
-    aligned[:, :3, 3] = alignment.scale * T_ref_cam[:, :3, 3] @ alignment.rotation.T + alignment.translation
+    aligned[:, :3, 3] = alignment.apply(T_ref_cam[:, :3, 3])
     return aligned
 
 

@@ -25,6 +25,10 @@ class Similarity(NamedTuple):
     rotation: Float[np.ndarray, "3 3"]
     translation: Float[np.ndarray, "3"]
 
+    def apply(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Points in the other world."""
+        return self.scale * points @ self.rotation.T + self.translation
+
 
 def make(
     rotation: Float[np.ndarray, "*#n 3 3"], translation: Float[np.ndarray, "*#n 3"]

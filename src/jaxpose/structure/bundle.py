@@ -109,7 +109,7 @@ def adjust(
     moved = np.where(supported[:, None, None], align(to_start, T), T_start)
     agree &= supported[problem.view]
     seen = np.unique(problem.point[agree])
-    place = to_start.scale * points[seen] @ to_start.rotation.T + to_start.translation
+    place = to_start.apply(points[seen])
     return Bundle(moved, supported, place, to_start.scale * errors.point_cam[agree, 2], sigma)
 
 

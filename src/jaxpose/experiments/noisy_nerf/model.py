@@ -9,18 +9,17 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from jaxtyping import Array, Float
 from scipy.interpolate import make_splrep
 
-from jaxpose import fields, optim, scenes
+from jaxpose import fields, scenes
 from jaxpose.datasets.types import Photographs
+from jaxpose.errors import DataError
 from jaxpose.experiments import training_loop
 from jaxpose.experiments.noisy_nerf.options import ORBIT, Config, Problem
 from jaxpose.experiments.noisy_nerf.registration import Registered
 from jaxpose.experiments.training_loop import CHUNK, Trained
 from jaxpose.fields import PoseField, PoseNetConfig
-from jaxpose.geometry import se3
 from jaxpose.scenes import NerfConfig, PlanesConfig, SceneField, nerf, with_occupancy
 from jaxpose.training.photometric import Depths, Sampler, TrainConfig, Views, importance, trainer
 from jaxpose.training.shutter import Shutter, shutter_of, with_shutter
@@ -40,7 +39,6 @@ _SHIFT_FROM, _TURN_FROM = 0.03, 0.06  # shares of the training
 # Poses by features stay until there is a scene: for so many rays, and at least this share of the training.
 _FORMED_RAYS, _REGISTERED_FROM = 250_000, 0.05
 _GRID_RATE, _DECODER_RATE = Decay(1e-2, 1e-3), Decay(2e-3, 2e-4)
-_FIT_RATE, _FIT_STEPS = 5e-4, 600
 # Parallax alone tells how cameras in one place have turned, and a blurred scene does not show it.
 _UNKNOWN_WINDOW = (0.0, 0.05)
 # Adam's first and last rate for translation and rotation, by how the training goes.
@@ -76,14 +74,27 @@ class Model(NamedTuple):
     between: Callable[[State], State] | None = None  # what is done to the state after every chunk of steps
 
 
+class _Preset(NamedTuple):
+    """What a preset trains, and how."""
+
+    scene: SceneField
+    rates: Any  # a prefix of the scene's parameters, of `Decay`s and zeros
+    train: TrainConfig
+    sampler: Sampler | None = None
+    between: Callable[[State], State] | None = None
+
+
 def build(config: Config, problem: Problem, registered: Registered | None = None) -> Model:
     """Scene, pose field and rates that the config names, for photographs and their registration, if any."""
     photographs = problem.train
     barf = photographs.spacing
-    scene, scene_rates, train, sampler, between = (
-        _perceptron(config, problem) if registered is None else _planes(config, problem, registered)
-    )
-    train = replace(train, chunk=config.devices.chunk(train.chunk))
+    depths = Depths(photographs.near, photographs.far, barf)
+    if registered is None:
+        preset = _perceptron(config, problem)
+    else:
+        depths = depths._replace(near=registered.near, far=registered.far)
+        preset = _planes(config, depths, registered)
+    train = replace(preset.train, chunk=config.devices.chunk(preset.train.chunk))
     t = jnp.asarray(photographs.t, jnp.float32)
     rates = _rates(config, problem, registered, train)
     field = _corrected(config, problem, registered)
@@ -91,28 +102,25 @@ def build(config: Config, problem: Problem, registered: Registered | None = None
     shutter = _shutter(config)
     if config.shutter == "estimate":
         field, pose_rates, shutter = _estimated_shutter(config, photographs, field, pose_rates)
-    optimizer = adam({"scene": scene_rates, "pose": pose_rates}, train.steps)
-    depths = Depths(photographs.near, photographs.far, photographs.spacing)
-    if registered is not None:
-        depths = depths._replace(near=registered.near, far=registered.far)
+    optimizer = adam({"scene": preset.rates, "pose": pose_rates}, train.steps)
     views = Views(
         t,
         jnp.asarray(photographs.rgb),
         None if photographs.mask is None else jnp.asarray(photographs.mask),
     )
-    named = scene_rates if isinstance(scene_rates, dict) else {"scene": scene_rates}
+    of_scene = preset.rates if isinstance(preset.rates, dict) else {"scene": preset.rates}
     return Model(
-        scene,
+        preset.scene,
         field,
-        {**{name: rate for name, rate in named.items() if rate}, **rates},
+        {name: rate for name, rate in of_scene.items() if rate} | rates,
         train,
         depths,
         views,
-        trainer(scene, field, photographs.camera, depths, optimizer, train, shutter, sampler),
+        trainer(preset.scene, field, photographs.camera, depths, optimizer, train, shutter, preset.sampler),
         shutter,
         _BARF_REFINE[barf],
-        sampler,
-        between,
+        preset.sampler,
+        preset.between,
     )
 
 
@@ -121,14 +129,18 @@ def initial_state(config: Config, problem: Problem, model: Model, registered: Re
     trained = training_loop.initial_state(model, config.seed)
     if registered is None or not _from_given_poses(config):
         return trained
-    pose = trained.state.pose
-    inner = pose["field"] if config.shutter == "estimate" else pose
-    fitted = _fitted(_corrected(config, problem, registered), inner, problem, registered)
-    pose = pose | {"field": fitted} if config.shutter == "estimate" else fitted
-    return trained._replace(state=trained.state._replace(pose=pose))
+    known = registered.supported
+    goal = problem.train.t[known], registered.T_world_cam[known]
+    # A move as long as scenes are far away is as large as a turn.
+    lengths = min((registered.near * registered.far) ** 0.5, 10 * registered.near)
+    try:
+        found = fields.fit(model.field, *goal, params=trained.state.pose, length_scale=lengths)
+    except ValueError as error:
+        raise DataError(f"{config.data}: poses by features: {error}") from None
+    return trained._replace(state=trained.state._replace(pose=found.params))
 
 
-def _perceptron(config: Config, problem: Problem) -> tuple[Any, ...]:
+def _perceptron(config: Config, problem: Problem) -> _Preset:
     """NeRF's network, which registers photographs by their colours alone."""
     paper = config.preset == "paper"
     if config.smoke:
@@ -137,20 +149,19 @@ def _perceptron(config: Config, problem: Problem) -> tuple[Any, ...]:
         scene, train = (nerf(), PAPER) if paper else (nerf(_joint_scene(config)), _JOINT)
         train = replace(train, steps=config.steps or train.steps, rays=config.rays or train.rays)
     rate = Decay(5e-4 if paper and problem.train.spacing == "depth" else 1e-3, 1e-4)
-    return scene, rate, train, None, None
+    return _Preset(scene, rate, train)
 
 
-def _planes(config: Config, problem: Problem, registered: Registered) -> tuple[Any, ...]:
+def _planes(config: Config, depths: Depths, registered: Registered) -> _Preset:
     """Planes and lines, which are sharp soon where poses are nearly right."""
     planes = PlanesConfig(registered.centre, registered.half)
     train = replace(_FAST, steps=config.steps or _FAST.steps, rays=config.rays or _FAST.rays)
     train = replace(train, chunk=train.rays)
-    depths = Depths(registered.near, registered.far, problem.train.spacing)
     sampler = importance(depths, partial(scenes.occupancy, planes), train.samples)
     emptied = jax.jit(lambda scene: with_occupancy(planes, scene))
     between = lambda state: state._replace(scene=emptied(state.scene))
     rates = {"grids": _GRID_RATE, "decoder": _DECODER_RATE, "occupancy": 0.0, "progress": 0.0}
-    return scenes.planes(planes), rates, train, sampler, between
+    return _Preset(scenes.planes(planes), rates, train, sampler, between)
 
 
 def _from_given_poses(config: Config) -> bool:
@@ -166,24 +177,6 @@ def _corrected(config: Config, problem: Problem, registered: Registered | None) 
     start = fields.piecewise_geodesic(jnp.asarray(t, jnp.float32), jnp.asarray(T_start, jnp.float32))
     correct = fields.left_correction if config.side == "world" else fields.right_correction
     return correct(_correction(config, problem), start)
-
-
-def _fitted(field: PoseField, params: Any, problem: Problem, registered: Registered) -> Any:
-    """The parameters at which a field goes through the registered poses."""
-    known = registered.supported
-    t = jnp.asarray(problem.train.t[known], jnp.float32)
-    goal = jnp.asarray(registered.T_world_cam[known], jnp.float32)
-    lengths = (registered.near * registered.far) ** 0.5 if np.isfinite(registered.far) else registered.near
-    lengths = min(lengths, 10 * registered.near)  # a move seen from there is as large as a turn
-    units = jnp.array([lengths] * 3 + [1.0] * 3)
-
-    def loss(params, step):
-        T = jax.vmap(field.pose, (None, 0))(params, t)
-        off = jax.vmap(lambda a, b: se3.log(se3.compose(se3.inverse(a), b)))(T, goal)
-        return jnp.mean(jnp.sum((off / units[None]) ** 2, axis=-1))
-
-    rate = optax.exponential_decay(_FIT_RATE, _FIT_STEPS, 0.02)
-    return jax.jit(lambda p: optim.minimize(loss, p, optax.adam(rate), _FIT_STEPS).params)(params)
 
 
 def splined(
@@ -296,8 +289,8 @@ def _rates(
         shift, turn = _PER_FRAME_RATES[start]
     if registered is not None:
         shift, turn = (_NET_RATES if config.pose == "posenet" else _PER_FRAME_RATES)["noisy"]
-        start = min(max(_FORMED_RAYS / (train.rays * train.steps), _REGISTERED_FROM), 0.5)
-        return {"translation": Decay(*shift, start), "rotation": Decay(*turn, start)}
+        formed = min(max(_FORMED_RAYS / (train.rays * train.steps), _REGISTERED_FROM), 0.5)
+        return {"translation": Decay(*shift, formed), "rotation": Decay(*turn, formed)}
     shift_from, turn_from = (0.0, 0.0) if paper else (_SHIFT_FROM, _TURN_FROM)
     return {"translation": Decay(*shift, shift_from), "rotation": Decay(*turn, turn_from)}
 
