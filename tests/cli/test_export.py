@@ -15,6 +15,7 @@ from jaxpose.cli import export
 from jaxpose.cli import main as main_command
 from jaxpose.cli.export import Config
 from jaxpose.datasets.photos import blender
+from jaxpose.datasets.rgbd import nerfstudio
 from jaxpose.errors import DataError
 from jaxpose.fields import numpy_evaluator
 from jaxpose.files import atomic, trajectories
@@ -107,25 +108,43 @@ def test_poses_come_back_from_transforms(run, tmp_path):
 
 
 @pytest.mark.parametrize("format", ["colmap", "colmap_binary"])
-def test_poses_and_points_come_back_from_colmap(run, tmp_path, format):
+def test_poses_points_and_images_come_back_from_colmap(run, recording, tmp_path, format):
     points, rgb = np.random.default_rng(1).normal(size=(9, 3)), np.full((9, 3), 7, np.uint8)
     write_ply(run / "points.ply", points, rgb)
-    result = exported(run, format, tmp_path / "sparse" / "0")
-    assert "9 points of points.ply" in result.notes[-1]
-    read = pycolmap.Reconstruction(tmp_path / "sparse" / "0")
+    result = exported(run, format, tmp_path / "scene")
+    assert "9 points of points.ply" in " ".join(result.notes)
+    read = pycolmap.Reconstruction(tmp_path / "scene" / "sparse" / "0")
     assert {tuple(p.xyz) for p in read.points3D.values()} == {
         tuple(p) for p in points.astype(np.float32).tolist()
     }
-    read = pycolmap.Reconstruction(tmp_path / "sparse" / "0")
     written = poses_of(run).T
     assert len(read.images) == COUNT
     for image in read.images.values():
         pose = np.vstack([image.cam_from_world().inverse().matrix(), [0, 0, 0, 1]])
         k = int(image.name.removeprefix("train/r_").removesuffix(".png"))
         np.testing.assert_allclose(pose, written[k], atol=1e-12)
+        copy = tmp_path / "scene" / "images" / image.name  # where trainers of Gaussian splatting look for it
+        assert copy.read_bytes() == (recording / image.name).read_bytes()
     (camera,) = read.cameras.values()
     assert camera.model.name == "OPENCV"
     np.testing.assert_allclose(camera.params, [44, 42, 23, 16, 0.1, 0, 0.002, 0.01])
+
+
+def test_depth_goes_to_transforms_and_back(run, recording, tmp_path):
+    """nerfstudio's documented key; read by the loader of folders with depth."""
+    counts = np.arange(48 * 32).reshape(32, 48).astype(np.uint16)
+    for k in range(COUNT):
+        Image.fromarray(counts + np.uint16(k)).save(recording / f"d_{k}.png")
+    names, depths = (tuple(text.format(k) for k in range(COUNT)) for text in ("train/r_{}.png", "d_{}.png"))
+    pinhole = CAMERA._replace(distortion=())
+    write_camera(run / "camera.json", pinhole, names, recording, depths=depths, depth_per_metre=5000.0)
+    result = exported(run, "transforms", recording / "transforms.json")
+    assert "--depth-unit-scale-factor 0.0002" in result.notes[-1]
+    content = json.loads((recording / "transforms.json").read_text())
+    assert [frame["depth_file_path"] for frame in content["frames"]] == list(depths)
+    read = nerfstudio.load(recording)
+    np.testing.assert_allclose(read.read(3).depth, (counts + 3) / np.float32(5000))
+    np.testing.assert_allclose(read.T_world_cam, poses_of(run).T, atol=1e-12)
 
 
 def test_the_continuous_trajectory(run, tmp_path):
@@ -192,7 +211,9 @@ def test_images_that_are_not_there(run, recording, tmp_path):
     write_camera(run / "camera.json", CAMERA, (), ".")
     result = exported(run, "colmap", tmp_path / "sparse")
     assert "names are made up" in result.notes[0]
-    names = {image.name for image in pycolmap.Reconstruction(tmp_path / "sparse").images.values()}
+    names = {
+        image.name for image in pycolmap.Reconstruction(tmp_path / "sparse" / "sparse" / "0").images.values()
+    }
     assert names == {f"frame-{k:06d}.png" for k in range(COUNT)}
 
 
@@ -214,7 +235,7 @@ def test_runs_of_before(run, tmp_path):
 
 def test_camera_files(tmp_path):
     write_camera(tmp_path / "camera.json", CAMERA, ("a.png", "b.png"), "images")
-    assert read_camera(tmp_path / "camera.json") == (CAMERA, ("a.png", "b.png"), tmp_path / "images")
+    assert read_camera(tmp_path / "camera.json")[:3] == (CAMERA, ("a.png", "b.png"), tmp_path / "images")
     whole = json.loads((tmp_path / "camera.json").read_text())
     for change, message in (
         ({"fx": 0}, "camera.json: fx: expected a finite number above 0 up to 1e+09, got 0"),
@@ -226,6 +247,11 @@ def test_camera_files(tmp_path):
         (
             {"images": ["../a.png"]},
             "camera.json: expected a file name that stays in its folder, got '../a.png'",
+        ),
+        ({"depths": ["a.png"]}, "camera.json: depth_per_metre: expected a finite number above 0"),
+        (
+            {"depths": ["a.png"], "depth_per_metre": 1000},
+            "camera.json: depths: expected one an image, 2, got 1",
         ),
         ({"images": [1]}, "camera.json: images: expected a list of file names, got [1]"),
         ({"images_folder": 3}, "camera.json: images_folder: expected a text, got 3"),

@@ -1,8 +1,9 @@
 """How far an estimated trajectory is from a reference: ATE, RPE and rotation error, with their protocol.
 
 ESTIMATE and REFERENCE are trajectory files (TUM, KITTI, EuRoC, TUM-VI or VINS csv, tables with a header,
-lists of 4x4 matrices: found by their content) or run folders of this package. Poses are paired by nearest
-timestamp, or row by row where a format has no timestamps; a run's continuous trajectory is evaluated at the
+lists of 4x4 matrices: found by their content), run folders of this package, recordings, or photographs with
+poses (COLMAP's models, transforms.json, LLFF). Poses are paired by nearest timestamp; where one of the two
+has none, by the names of the images or row by row. A run's continuous trajectory is evaluated at the
 reference's own timestamps.
 """
 
@@ -26,7 +27,7 @@ from jaxpose.experiments.command import Command, execute
 from jaxpose.experiments.outcome import markdown_table
 from jaxpose.experiments.progress import OnUpdate, Update, silent
 from jaxpose.files import trajectories
-from jaxpose.files.association import associate, nearest
+from jaxpose.files.association import associate, associate_names, nearest
 from jaxpose.geometry import rigid
 from jaxpose.geometry.rigid import Similarity
 
@@ -223,6 +224,8 @@ def _pair(config: Config, estimate: Source, reference: Source) -> _Pairs:
     if match == "exact":
         return _exact(config, estimate, reference)
     if not (estimate.stamped and reference.stamped):
+        if estimate.names and reference.names:
+            return _by_name(estimate, reference)
         return _row_by_row(config, estimate, reference)
     t_reference, T_reference, t0_ns = reference.trajectory
     t_estimate = trajectories.since(estimate.trajectory, t0_ns - round(config.time_offset_s * 1e9))
@@ -241,6 +244,18 @@ def _pair(config: Config, estimate: Source, reference: Source) -> _Pairs:
     how = f"of {fewer} poses of the shorter one: nearest timestamps, {most}"
     how += f"; the estimate's moved by {config.time_offset_s:g} s" if config.time_offset_s else ""
     return _Pairs(t_reference[of_reference], T_estimate[of_estimate], T_reference[of_reference], how, True)
+
+
+def _by_name(estimate: Source, reference: Source) -> _Pairs:
+    """Poses of the same images, where one of the two has no timestamps."""
+    of_estimate, of_reference = associate_names(estimate.path, estimate.names, reference.names)
+    t = reference.trajectory.t[of_reference]
+    if not reference.stamped:
+        t = estimate.trajectory.t[of_estimate]
+    fewer = min(len(estimate.names), len(reference.names))
+    how = f"of {fewer} poses of the shorter one: names of images, as not both have timestamps"
+    T_estimate, T_reference = estimate.trajectory.T[of_estimate], reference.trajectory.T[of_reference]
+    return _Pairs(t, T_estimate, T_reference, how, reference.stamped or estimate.stamped)
 
 
 def _row_by_row(config: Config, estimate: Source, reference: Source) -> _Pairs:

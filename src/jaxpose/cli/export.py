@@ -5,18 +5,17 @@ axes right, down, forward, in the world of the run's trajectory.txt. They are th
 run's continuous trajectory at --rate-hz or at the timestamps of a file (--at).
 """
 
-import os
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 import tyro
 from jaxtyping import Float
 
-from jaxpose.cli.source import FIELD, Source, images_on_disk, read_field, read_source
+from jaxpose.cli.source import FIELD, Source, read_covariance, read_field, read_source
 from jaxpose.errors import DataError
 from jaxpose.experiments.checks import check_apart, check_positive
 from jaxpose.experiments.command import Command, execute
@@ -26,15 +25,22 @@ from jaxpose.files.association import nearest
 from jaxpose.files.tables import seconds
 from jaxpose.files.timestamps import format_ns
 
-if TYPE_CHECKING:
-    from jaxpose.geometry.camera import Camera
-
-Format = Literal["tum", "csv", "kitti", "euroc", "transforms", "colmap", "colmap_binary", "npz", "same"]
+Format = Literal[
+    "tum",
+    "csv",
+    "kitti",
+    "euroc",
+    "transforms",
+    "colmap",
+    "colmap_binary",
+    "mcap",
+    "bag",
+    "rerun",
+    "npz",
+    "same",
+]
 _SAME: dict[str, Format] = {"TUM": "tum", "CSV": "csv", "KITTI": "kitti", "EuRoC": "euroc"}
 _OWN_NS = 1000  # timestamps closer than this are the same: others write float64 seconds since 1970, to 240 ns
-
-
-_MOST_POINTS = 200_000  # of a COLMAP model
 
 
 @dataclass(frozen=True)
@@ -44,8 +50,10 @@ class Config:
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]  # run folder, or trajectory file
     # tum: `t tx ty tz qx qy qz qw`; csv: the same between commas; kitti: 3x4 matrices without timestamps;
     # euroc: csv with timestamps in ns, quaternion wxyz; same: the one of these that RUN is a file of;
-    # transforms: transforms.json for nerfstudio and instant-ngp; colmap: a model in text or binary; npz: the
-    # continuous trajectory itself, which `jaxpose/fields/numpy_evaluator.py` evaluates with numpy alone.
+    # transforms: transforms.json for nerfstudio and instant-ngp; colmap: a folder with the model in sparse/0,
+    # in text or binary, and copies of the images; mcap, bag: poses, path and tf of ROS 2 or ROS 1 (extra
+    # `ros`); rerun: .rrd (extra `rerun`); npz: the continuous trajectory itself, which
+    # `jaxpose/fields/numpy_evaluator.py` evaluates with numpy alone.
     format: Format
     out: Path  # file to write; colmap: folder
     rate_hz: float | None = None  # [Hz] poses at this rate from the first frame on; None: at the frames
@@ -99,7 +107,7 @@ def run(config: Config, on_update: OnUpdate = silent) -> Result:
             f"{source.path}: expected a {', '.join(_SAME)} file for --format same, got a {source.what}"
         )
     (trajectory, xyzw), times, notes = _chosen(config, source)
-    if not source.stamped and form in ("tum", "csv", "euroc"):
+    if not source.stamped and form in ("tum", "csv", "euroc", "mcap", "bag", "rerun"):
         raise DataError(f"{source.path}: expected timestamps for --format {form}, got a {source.what}")
     if form == "kitti" and source.lines > len(source.trajectory.t) and not source.stamped:
         raise DataError(f"{source.path}: expected finite poses for --format kitti, got {source}")
@@ -113,8 +121,17 @@ def run(config: Config, on_update: OnUpdate = silent) -> Result:
     elif form == "kitti":
         trajectories.write_kitti(config.out, trajectory.T)
         notes += _kitti_times(config, source, trajectory)
+    elif form in ("mcap", "bag"):
+        notes += _ros(config.out, form, source, trajectory)
+    elif form == "rerun":
+        notes += _rerun(config.out, source, trajectory)
     else:
-        notes += _with_images(config, source, trajectory)
+        from jaxpose.cli import export_images  # here, as it loads jax
+
+        if form == "transforms":
+            notes += export_images.export_transforms(source, config.out)
+        else:
+            notes += export_images.export_colmap(source, config.out, binary=form == "colmap_binary")
     return Result(str(source), config.out, form, len(trajectory.t), times, notes)
 
 
@@ -125,6 +142,27 @@ def _kitti_times(config: Config, source: Source, trajectory: trajectories.Trajec
     file = config.out.with_name(f"{config.out.stem}_times.txt")
     atomic.write_text(file, "".join(f"{t!r}\n" for t in np.asarray(trajectory.t, np.float64).tolist()))
     return (f"the format has no timestamps: those of its lines are in {file}",)
+
+
+def _ros(
+    out: Path, form: Literal["mcap", "bag"], source: Source, trajectory: trajectories.Trajectory
+) -> tuple[str, ...]:
+    """Poses as messages of ROS, with their covariances where the run knows them."""
+    from jaxpose.files.ros_poses import CAMERA, WORLD, write_ros_poses
+
+    covariance, sure = read_covariance(source, trajectory)
+    write_ros_poses(out, trajectory, covariance, form=form)
+    return (f"/pose {sure}, /path, and /tf of {CAMERA} in {WORLD}",)
+
+
+def _rerun(out: Path, source: Source, trajectory: trajectories.Trajectory) -> tuple[str, ...]:
+    """A recording of rerun, with the camera and the points of a run."""
+    from jaxpose.cli.export_images import run_camera, run_points
+    from jaxpose.files.rerun_file import write_rerun
+
+    points, rgb, told = run_points(source.path / "points.ply") if source.is_run else (None, None, "no points")
+    write_rerun(out, trajectory, run_camera(source), points=points, rgb=rgb)
+    return (told,)
 
 
 def main(args: Sequence[str] | None = None, prog: str = "jaxpose export") -> None:
@@ -203,76 +241,3 @@ def _continuous(config: Config, source: Source) -> Result:
         shutil.copyfile(source.path / FIELD, temporary)
     times = f"made for {first:.3f} to {last:.3f} s"
     return Result(str(source), config.out, config.format, None, times, ())
-
-
-def _with_images(config: Config, source: Source, trajectory: trajectories.Trajectory) -> tuple[str, ...]:
-    """Write the poses of the images by their names; notes on these and on the camera."""
-    from jaxpose.datasets.photos.transforms_json import write_transforms
-    from jaxpose.datasets.types import Photographs
-    from jaxpose.files.camera_json import read_camera
-    from jaxpose.files.colmap import write_colmap
-
-    if not source.is_run:
-        raise DataError(
-            f"{source.path}: expected a run folder for --format {config.format}, got a {source.what}: it "
-            "names neither camera nor images"
-        )
-    camera, images, folder = read_camera(source.path / "camera.json")
-    t, T_world_cam, _ = trajectory
-    if images and len(images) != len(t):
-        raise DataError(f"{source.path}: expected {len(images)} poses, one an image, got {len(t)}")
-    if not images and (source.path / "transforms.json").is_file():
-        raise DataError(
-            f"{source.path}: expected images of one camera for --format {config.format}, got a run that "
-            "brought them to one: its transforms.json has the poses with the lens of each"
-        )
-    found, notes = images_on_disk(folder, images), ()
-    if found:
-        camera, notes = _as_on_disk(camera, found[0])
-        images = tuple(file.relative_to(folder).as_posix() for file in found)
-    elif images:
-        images = tuple(Path(name).as_posix() for name in images)
-        notes = (f"not all images are in {folder}: names and camera are those that the run had",)
-    else:
-        images = tuple(f"frame-{number:06d}.png" for number in range(len(t)))
-        notes = ("the images of the run are on no disk: their names are made up",)
-    cloud = source.path / "points.ply"
-    if config.format != "transforms":
-        points, rgb, told = _points(cloud)
-        binary = config.format == "colmap_binary"
-        write_colmap(config.out, camera, images, T_world_cam, points=points, rgb=rgb, binary=binary)
-        return *notes, f"{told}; image names are relative to {folder if found else 'their folder'}"
-    if found:
-        images = tuple(os.path.relpath(file.resolve(), config.out.parent.resolve()) for file in found)
-    pixels = np.empty((len(t), 0, 0, 3), np.uint8)  # only names are written; depths are unknown
-    name = source.path.name
-    shots = Photographs(name, camera, t, pixels, T_world_cam, np.nan, np.nan, "disparity", images)
-    here = config.out.parent.resolve()
-    write_transforms(
-        config.out, shots, points=os.path.relpath(cloud.resolve(), here) if cloud.is_file() else None
-    )
-    return *notes, "axes right, up, back, as these files have them"
-
-
-def _points(file: Path) -> tuple[np.ndarray | None, np.ndarray | None, str]:
-    """The points of a run with their colours, not more than trainers begin with, and what there is to say."""
-    from jaxpose.files.ply import read_coloured_points
-
-    if not file.is_file():
-        return None, None, "no points"
-    points, rgb = read_coloured_points(file)
-    chosen = np.unique(np.linspace(0, len(points) - 1, min(len(points), _MOST_POINTS)).round().astype(int))
-    share = "" if len(chosen) == len(points) else f" of {len(points)}"
-    return points[chosen], rgb[chosen], f"{len(chosen)}{share} points of {file.name}, without their matches"
-
-
-def _as_on_disk(camera: "Camera", file: Path) -> tuple["Camera", tuple[str, ...]]:
-    """The camera of the images as they are in their files, which a run may have made smaller."""
-    from jaxpose.datasets.images import image_size
-    from jaxpose.geometry.camera import resized
-
-    width, height = image_size(file)
-    if (width, height) == (camera.width, camera.height):
-        return camera, ()
-    note = f"the camera is that of the files, {width}x{height}; the run used {camera.width}x{camera.height}"
-    return resized(camera, width, height), (note,)

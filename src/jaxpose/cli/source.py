@@ -14,7 +14,7 @@ from jaxpose.files.timestamps import format_ns
 from jaxpose.files.untrusted import read_json
 
 FIELD = "field.npz"
-_RECORDINGS = (".bag", ".mcap", ".db3", ".r3d")  # suffixes of files that are recordings
+_DATA = (".bag", ".mcap", ".db3", ".r3d", ".mkv", ".json")  # suffixes of files that are no trajectories
 
 
 class Source(NamedTuple):
@@ -26,6 +26,7 @@ class Source(NamedTuple):
     stamped: bool  # False: the pose of line i is said to be at i seconds
     file: trajectories.TrajectoryFile | None = None  # None: a run
     is_recording: bool = False  # whose true poses these are
+    names: tuple[str, ...] = ()  # of the image of each pose, where they are known
 
     @property
     def is_run(self) -> bool:
@@ -48,11 +49,11 @@ class Source(NamedTuple):
 
 
 def read_source(path: Path, columns: str | None = None) -> Source:
-    """Read a trajectory file, the trajectory of a run folder, or the true poses of a recording.
+    """Read a trajectory file, the trajectory of a run folder, or the poses of a recording or of photographs.
 
     DataError or OSError for what is none of them. `columns` names those of a file, as `read_trajectory` says.
     """
-    if path.suffix.lower() in _RECORDINGS and path.is_file() and (found := _recording(path)) is not None:
+    if path.suffix.lower() in _DATA and path.is_file() and (found := _of_data(path)) is not None:
         return found
     if not path.is_dir():
         if not path.exists():
@@ -63,7 +64,7 @@ def read_source(path: Path, columns: str | None = None) -> Source:
         raise DataError(f"{path}: expected a file for --columns {columns!r}, got a folder")
     file = path / "trajectory.txt"
     if not file.is_file():
-        if (found := _recording(path)) is not None:
+        if (found := _of_data(path)) is not None:
             return found
         inner = sorted(folder.parent.name for folder in path.glob("*/trajectory.txt"))
         hint = f"runs in it: {', '.join(inner)}" if inner else "none"
@@ -71,25 +72,23 @@ def read_source(path: Path, columns: str | None = None) -> Source:
     trajectory = trajectories.read_tum(file)
     # A run's files are all on one clock, which its field takes as float64 seconds.
     trajectory = trajectories.Trajectory(trajectories.since(trajectory, 0), trajectory.T)
-    return Source(path, f"{_experiment(path / 'results.json')} run".strip(), trajectory, True)
+    what = f"{_experiment(path / 'results.json')} run".strip()
+    return Source(path, what, trajectory, True, names=_names_of_run(path, len(trajectory.t)))
 
 
-def _recording(path: Path) -> Source | None:
-    """The true poses of a recording; None for what is none, DataError for one without."""
-    from jaxpose.datasets.rgbd import registry  # here, as its room loads jax
+def _of_data(path: Path) -> Source | None:
+    from jaxpose.cli.data_poses import read_data  # here, as it loads jax
 
-    form = registry.detect(path)
-    if form is None:
-        return None
-    recording = registry.load_recording(path, form)
-    if recording.T_world_cam is None:
-        raise DataError(f"{path}: expected a recording with true poses, got a {form} one without")
-    known = np.isfinite(recording.T_world_cam).all((1, 2))
-    trajectory = trajectories.Trajectory(recording.t[known], recording.T_world_cam[known], recording.t0_ns)
-    missing, stamped = int((~known).sum()), registry.has_timestamps(path, form)
-    notes = (f"{missing} frames without a true pose",) if missing else ()
-    file = trajectories.TrajectoryFile(trajectory, "TUM", stamped, notes, 0, missing, len(recording.t))
-    return Source(path, f"{form} recording", trajectory, stamped, file, is_recording=True)
+    return read_data(path)
+
+
+def _names_of_run(path: Path, count: int) -> tuple[str, ...]:
+    """The images of a run, one a pose; none where it says less."""
+    from jaxpose.files.camera_json import read_camera
+
+    file = path / "camera.json"
+    names = read_camera(file).images if file.is_file() else ()
+    return names if len(names) == count else ()
 
 
 def read_field(source: Source) -> Callable[[Float[np.ndarray, " n"]], Float[np.ndarray, "n 4 4"]]:
@@ -117,6 +116,23 @@ def read_field(source: Source) -> Callable[[Float[np.ndarray, " n"]], Float[np.n
         return T
 
     return finite
+
+
+def read_covariance(
+    source: Source, trajectory: trajectories.Trajectory
+) -> tuple[Float[np.ndarray, "n 6 6"] | None, str]:
+    """Covariances of a run's poses, of increments on the right, or None; and which, in words."""
+    file = source.path / FIELD
+    if not source.is_run or not file.is_file():
+        return None, "without covariances"
+    from jaxpose.fields import _entries, numpy_evaluator  # here, as their room loads jax
+
+    if "covariance" not in _entries.read_entries(file):
+        return None, f"without covariances, which {FIELD} does not have"
+    try:
+        return numpy_evaluator.load_covariance(file)(trajectories.since(trajectory, 0)), "with covariances"
+    except ValueError as error:  # of times beyond those that are known
+        return None, f"without covariances: {str(error)[:80]}"
 
 
 def images_on_disk(folder: Path, names: tuple[str, ...]) -> list[Path]:

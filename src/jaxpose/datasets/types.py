@@ -54,6 +54,8 @@ class Recording(NamedTuple):
     gravity_world: np.ndarray = _read_only(np.array(GRAVITY_WORLD))  # in the frame of `T_world_cam`
     notes: tuple[str, ...] = ()  # notes of the loader for the user
     files: tuple[str, ...] = ()  # each colour image, relative to the recording's folder; empty: on no disk
+    depth_files: tuple[str, ...] = ()  # likewise those of depth, where they are PNG of counts and no more
+    depth_per_metre: float = 1000.0  # their counts
     t0_ns: int = 0  # where `t` is 0 on the clock of the recording's files [ns]
     accelerometer: Accelerometer | None = None  # on the clock of `t`, of a recording without IMU
 
@@ -196,6 +198,7 @@ def select(recording: Recording, indices: np.ndarray) -> Recording:
         read=lambda i: recording.read(int(indices[i])),
         T_world_cam=None if poses is None else poses[indices],
         files=tuple(recording.files[i] for i in indices) if recording.files else (),
+        depth_files=tuple(recording.depth_files[i] for i in indices) if recording.depth_files else (),
     )
 
 

@@ -1,6 +1,8 @@
 """Videos (mp4, mkv) through PyAV: frames decoded when asked for."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -12,31 +14,58 @@ EXTRA = 'pip install -e ".[video]"'
 _NEAR = 8  # frames ahead that are decoded on the way instead of sought
 
 
-class Video:
-    """The first video track of a file. Needs the package av (extra `video`).
+@contextmanager
+def opened(path: Path) -> Iterator[Any]:
+    """Open a file of tracks. Needs the package av (extra `video`).
 
     Args:
         path: The file.
+
+    Yields:
+        PyAV's container.
+
+    Raises:
+        DataError: For whatever goes wrong with it, and without the package.
+    """
+    try:
+        import av
+    except ImportError:
+        raise DataError(f"{path}: a video needs the package av: {EXTRA}") from None
+    try:
+        with av.open(str(path)) as container:
+            yield container
+    except DataError:
+        raise
+    except Exception as error:  # PyAV raises many kinds
+        raise _damaged(path, error) from None
+
+
+class Video:
+    """A video track of a file. Needs the package av (extra `video`).
+
+    Args:
+        path: The file.
+        track: Its number among the video tracks.
+        stamps: Of its frames, where they are known: else the file is passed over for them.
 
     Raises:
         DataError: For what is no video, or of a codec that is not there, and without the package.
     """
 
-    def __init__(self, path: Path):
+    def __init__(self, path: Path, track: int = 0, stamps: Sequence[int] = ()):
         self.path = path
+        if not stamps:
+            with opened(path) as container:
+                stamps = [packet.pts for packet in container.demux(video=track) if packet.pts is not None]
+        import av
+
         try:
-            import av
-        except ImportError:
-            raise DataError(f"{path}: a video needs the package av: {EXTRA}") from None
-        try:
-            with av.open(str(path)) as container:
-                stamps = [packet.pts for packet in container.demux(video=0) if packet.pts is not None]
             self._container = av.open(str(path))
-            self._stream = self._container.streams.video[0]
+            self._stream = self._container.streams.video[track]
             self._stream.thread_type = "AUTO"
             self.size = (self._stream.codec_context.width, self._stream.codec_context.height)
-        except Exception as error:  # PyAV raises many kinds
-            raise self._damaged(error) from None
+        except Exception as error:
+            raise _damaged(path, error) from None
         if not stamps or min(self.size) < 1:
             raise DataError(f"{path}: expected a video with frames, got none")
         self._pts = sorted(set(stamps))
@@ -46,8 +75,22 @@ class Video:
     def __len__(self) -> int:
         return len(self._pts)
 
+    @property
+    def ns(self) -> list[int]:
+        """Timestamps of the frames on the file's clock [ns]."""
+        unit = self._stream.time_base or Fraction(1)
+        return [round(pts * unit * 10**9) for pts in self._pts]
+
     def read(self, i: int, size: tuple[int, int] | None = None) -> np.ndarray:
         """Frame i as (height, width, 3) uint8 RGB, resized by area to `size` (width, height) if given."""
+        width, height = size or self.size
+        return self._read(i, lambda frame: frame.reformat(width, height, "rgb24", interpolation="AREA"))
+
+    def counts(self, i: int) -> np.ndarray:
+        """Frame i of a grey track of 16 bits, as (height, width) uint16."""
+        return self._read(i, lambda frame: frame.reformat(format="gray16le"))
+
+    def _read(self, i: int, reformat: Callable[[Any], Any]) -> np.ndarray:
         try:
             if not self._next <= i < self._next + _NEAR:
                 self._container.seek(self._pts[i], stream=self._stream)
@@ -55,13 +98,11 @@ class Video:
             for at, frame in self._frames:
                 self._next = at + 1
                 if at == i:
-                    width, height = size or self.size
-                    resized = frame.reformat(width, height, "rgb24", interpolation="AREA")
-                    return resized.to_ndarray()
+                    return reformat(frame).to_ndarray()
                 if at > i:
                     break
         except Exception as error:
-            raise self._damaged(error) from None
+            raise _damaged(self.path, error) from None
         self._next = len(self._pts)
         raise DataError(f"{self.path}: expected frame {i} of {len(self)}, got none that can be decoded")
 
@@ -71,6 +112,7 @@ class Video:
             if frame.pts in self._rank:
                 yield self._rank[frame.pts], frame
 
-    def _damaged(self, error: Exception) -> DataError:
-        words = " ".join(str(error).split()) or type(error).__name__
-        return DataError(f"{self.path}: expected a video, got {words[:200]}")
+
+def _damaged(path: Path, error: Exception) -> DataError:
+    words = " ".join(str(error).split()) or type(error).__name__
+    return DataError(f"{path}: expected a video, got {words[:200]}")

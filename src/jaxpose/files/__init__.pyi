@@ -10,6 +10,8 @@ from .colmap import write_colmap as write_colmap
 from .ply import read_coloured_points as read_coloured_points
 from .ply import read_points as read_points
 from .ply import write_ply as write_ply
+from .rerun_file import write_rerun as write_rerun
+from .ros_poses import write_ros_poses as write_ros_poses
 from .trajectories import Trajectory as Trajectory
 from .trajectories import TrajectoryFile as TrajectoryFile
 from .trajectories import read_euroc as read_euroc

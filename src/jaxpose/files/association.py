@@ -1,11 +1,16 @@
 """Pairs of timestamps."""
 
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
 import numpy as np
 from jaxtyping import Float, Int
 
 from jaxpose._checks import check_increasing
 from jaxpose.errors import DataError
 
+_SUFFIX = re.compile(r"\.(png|jpe?g|tiff?|bmp|webp)$", re.IGNORECASE)  # others are parts of names: 1.25
 _SAME_S = 5e-10  # distances that differ by less are equal: timestamps are whole ns, their floats are not
 
 
@@ -47,6 +52,32 @@ def associate(
             f"{nearest_two}"
         )
     return near_a[close], near_b[close]
+
+
+def associate_names(where: Path | str, a: Sequence[str], b: Sequence[str]) -> tuple[list[int], list[int]]:
+    """Pair images of two lists by name: the parts of their paths from the end that are their own in both.
+
+    Args:
+        where: What the first list is of, for errors.
+        a: Names (a,), with or without suffix.
+        b: Names (b,).
+
+    Returns:
+        Indices into both lists, (m,) each, in the order of the second.
+
+    Raises:
+        DataError: If no name is in both, or one stands for several images.
+
+    >>> associate_names("a", ["left/1.png", "left/2.png"], ["2", "1", "0"])
+    ([1, 0], [0, 1])
+    """
+    parts = [[_SUFFIX.sub("", name).replace("\\", "/").split("/") for name in names] for names in (a, b)]
+    for count in range(max(map(len, parts[0] + parts[1]), default=0), 0, -1):
+        rows_a, rows_b = ({tuple(name[-count:]): row for row, name in enumerate(names)} for names in parts)
+        both = [name for name in rows_b if name in rows_a]
+        if both and len(rows_a) == len(a) and len(rows_b) == len(b):
+            return [rows_a[name] for name in both], [rows_b[name] for name in both]
+    raise DataError(f"{where}: expected names of images as {', '.join(b[:3])}, got {', '.join(a[:3])}")
 
 
 def nearest(t: Float[np.ndarray, " n"], among: Float[np.ndarray, " m"]) -> Int[np.ndarray, " n"]:

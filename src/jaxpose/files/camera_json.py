@@ -3,7 +3,7 @@
 import reprlib
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from jaxpose.errors import DataError
 from jaxpose.files.atomic import write_json
@@ -21,9 +21,19 @@ class CameraFile(NamedTuple):
     camera: Camera  # of the images as the run used them, which may have made them smaller
     images: tuple[str, ...]  # one a frame, relative to `folder`; empty where they are on no disk
     folder: Path
+    depths: tuple[str, ...] = ()  # one a frame, 16 bits, registered to images; empty where there are none
+    depth_per_metre: float = 1000.0  # their counts
 
 
-def write_camera(path: Path | str, camera: Camera, images: tuple[str, ...], folder: Path | str) -> None:
+def write_camera(
+    path: Path | str,
+    camera: Camera,
+    images: tuple[str, ...],
+    folder: Path | str,
+    *,
+    depths: tuple[str, ...] = (),
+    depth_per_metre: float = 1000.0,
+) -> None:
     """Write `camera.json`.
 
     Args:
@@ -31,8 +41,12 @@ def write_camera(path: Path | str, camera: Camera, images: tuple[str, ...], fold
         camera: Of the images as the run used them.
         images: A name for each frame, relative to `folder`; empty where they are on no disk.
         folder: Absolute, or relative to the file.
+        depths: A name of a depth image for each frame, relative to `folder` too; empty where there are none.
+        depth_per_metre: Counts of depth a metre.
     """
-    write_json(path, {**camera._asdict(), "images": images, "images_folder": str(folder)})
+    content = {**camera._asdict(), "images": images, "images_folder": str(folder)}
+    content |= {"depths": depths, "depth_per_metre": depth_per_metre} if depths else {}
+    write_json(path, content)
 
 
 def read_camera(path: Path | str) -> CameraFile:
@@ -61,8 +75,21 @@ def read_camera(path: Path | str) -> CameraFile:
     cx, cy = (float(number(key, least=-_MOST, most=_MOST)) for key in ("cx", "cy"))
     width, height = (int(number(key, whole=True, least=1, most=MOST_PIXELS)) for key in ("width", "height"))
     camera = Camera(fx, fy, cx, cy, width, height, tuple(lens.tolist()))
-    images = content.get("images")
-    if not isinstance(images, list) or not all(isinstance(name, str) for name in images):
-        raise DataError(f"{path}: images: expected a list of file names, got {reprlib.repr(images)}")
     folder = path.parent / choice(path, content, "images_folder")
-    return CameraFile(camera, tuple(name_inside(path, name) for name in images), folder)
+    images, depths = _names(path, content, "images"), ()
+    per_metre = 1000.0
+    if "depths" in content:
+        depths, per_metre = (
+            _names(path, content, "depths"),
+            float(number("depth_per_metre", above=0, most=_MOST)),
+        )
+        if len(depths) != len(images):
+            raise DataError(f"{path}: depths: expected one an image, {len(images)}, got {len(depths)}")
+    return CameraFile(camera, images, folder, depths, per_metre)
+
+
+def _names(path: Path, content: dict[str, Any], key: str) -> tuple[str, ...]:
+    names = content.get(key)
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise DataError(f"{path}: {key}: expected a list of file names, got {reprlib.repr(names)}")
+    return tuple(name_inside(path, name) for name in names)

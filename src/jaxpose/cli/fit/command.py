@@ -1,8 +1,9 @@
 """Which pose field carries a motion: several fitted to timestamped poses, and the error of each.
 
-TRAJECTORY is a file of timestamped poses (TUM, KITTI, EuRoC or TUM-VI csv, 4x4 lists: found by its content)
-or a run folder. Every tenth pose is held out. With --imu the fields' own derivatives, which have seen poses
-only, are compared with a gyroscope and an accelerometer.
+TRAJECTORY is a file of timestamped poses (TUM, KITTI, EuRoC or TUM-VI csv, 4x4 lists: found by its content),
+a run folder, a recording with true poses, or photographs with poses (COLMAP's models, transforms.json). Every
+tenth pose is held out. With --imu the fields' own derivatives, which have seen poses only, are compared with
+a gyroscope and an accelerometer.
 
 With --imu and --estimate poses and readings together give one trajectory, in metres and upright, with its
 covariance, and the sensors: how far apart their clocks are, how the camera is mounted, scale, biases.

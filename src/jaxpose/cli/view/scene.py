@@ -86,7 +86,7 @@ def _camera(source: Source) -> tuple["Camera", tuple[Path, ...], tuple[str, ...]
     if not (source.is_run and file.is_file()):
         made_up = Camera(140.0, 140.0, 79.5, 59.5, 160, 120)
         return made_up, (), ("no camera.json: the frustums' angle of view is made up, their images unknown",)
-    camera, names, folder = read_camera(file)
+    camera, names, folder, *_ = read_camera(file)
     if names and len(names) != len(source.trajectory.t):
         raise DataError(f"{file}: expected {len(source.trajectory.t)} images, one a frame, got {len(names)}")
     images = tuple(images_on_disk(folder, names))

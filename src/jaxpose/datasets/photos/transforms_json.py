@@ -1,6 +1,7 @@
 """Poses written back as `transforms.json`, for Blender's readers, nerfstudio and instant-ngp."""
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,8 @@ def write_transforms(
     *,
     source: Path | str | None = None,
     points: str | None = None,
+    depths: Sequence[str] = (),
+    depth_per_metre: float = 1000.0,
 ) -> None:
     """Write the poses of photographs, camera-to-world in OpenGL axes, with file names as their source has.
 
@@ -31,6 +34,8 @@ def write_transforms(
             Without it the cameras of the files (`lenses`, else `camera`) are written anew, one for all or one
             for each, and the times of the images.
         points: A PLY file of the scene's points, relative to the json file.
+        depths: A depth image of 16 bits for each photograph, relative to it too; none with `source`.
+        depth_per_metre: Their counts.
 
     Raises:
         DataError: For poses with NaN or infinity, and for photographs that `source` does not list.
@@ -44,6 +49,9 @@ def write_transforms(
         content, each = _header(photographs), _cameras(path, photographs)
         if all(keys == each[0] for keys in each):
             content, each = each[0] | content, [{}] * len(each)
+        if depths:
+            content["depth_unit_scale_factor"] = 1 / depth_per_metre
+            each = [keys | {"depth_file_path": name} for keys, name in zip(each, depths, strict=True)]
         times = np.asarray(photographs.t, np.float64).tolist()
         frames = [
             {"file_path": name, "time": t, **keys}

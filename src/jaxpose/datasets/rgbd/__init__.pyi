@@ -1,4 +1,5 @@
 from . import arkitscenes as arkitscenes
+from . import azure_kinect as azure_kinect
 from . import euroc as euroc
 from . import icl_nuim as icl_nuim
 from . import nerfstudio as nerfstudio

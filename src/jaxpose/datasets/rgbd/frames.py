@@ -208,9 +208,10 @@ def of_files(
     Raises:
         DataError: Naming the file for anything that cannot be used.
     """
-    unit = "depth"
+    unit, of_depth = "depth", ()
     size = common_size(colors)
     if depth_of is None:
+        of_depth = within(depths, path)
         if _same_shape(size, image_size(depths[0])):
             common_size(depths)
         depth_of, unit = (lambda i: read_depth(depths[i], per_metre)), depth_unit(per_metre)
@@ -223,6 +224,7 @@ def of_files(
     )
     files = within(colors, path)
     recording = assembled(depths[0], images, intrinsics, first_color=colors[0].name, files=files, **more)
+    recording = recording._replace(depth_files=of_depth, depth_per_metre=per_metre)
     return recording._replace(name=name_of(Path(path)))
 
 

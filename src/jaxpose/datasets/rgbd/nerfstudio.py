@@ -49,8 +49,9 @@ def has_timestamps(path: Path) -> bool:
 def load(path: Path | str, *, rate_hz: float = 30.0) -> Recording:
     """Read a folder of nerfstudio's with depth.
 
-    A frame without colour or depth is left out and counted. Depth is a PNG of 16 bits in mm, or an array
-    (npy) in mm where its values are above 50, else in metres. Poses are camera-to-world in OpenGL's axes, in
+    A frame without colour or depth is left out and counted. Depth is a PNG of 16 bits in mm (or in the file's
+    `depth_unit_scale_factor`, metres a count), or an array (npy) in mm where its values are above 50, else in
+    metres. Poses are camera-to-world in OpenGL's axes, in
     the file's world, whose z nerfstudio turns up. The camera is the file's, or the median of those of the
     frames; cx and cy are counted from the outer corner of the first pixel. Times are the frames' `time` or
     `timestamp` [s] if each has one of its own, in the order of their names else.
@@ -88,6 +89,9 @@ def load(path: Path | str, *, rate_hz: float = 30.0) -> Recording:
         t = [round(float(stamps[row]) * 1e9) for row in rows]
     used = [frames[row] for row in rows]
     poses = np.stack([_pose(file, frame) for frame in used]) @ OPENGL
+    per_metre = 1000.0
+    if "depth_unit_scale_factor" in content:
+        per_metre = 1 / float(numbers(file, content, "depth_unit_scale_factor", above=0, most=0.1))
     return of_files(
         path,
         colors,
@@ -96,7 +100,7 @@ def load(path: Path | str, *, rate_hz: float = 30.0) -> Recording:
         t=t,
         names=[color.stem for color in colors],
         poses=Poses(poses, lambda i: f"{file}: {used[i]['file_path']}"),
-        depth_of=lambda i: _depth(depths[i]),
+        depth_of=lambda i: _depth(depths[i], per_metre),
         notes=(note,) if lacking else (),
     )
 
@@ -150,9 +154,9 @@ def _camera(
     return Camera(*pinhole, *size, lens if any(lens) else ()), focus
 
 
-def _depth(file: Path) -> np.ndarray:
+def _depth(file: Path, per_metre: float) -> np.ndarray:
     if file.suffix.lower() != ".npy":
-        return read_depth(file)
+        return read_depth(file, per_metre)
     depth = np.squeeze(read_npy(file, "depth")).astype(np.float32)
     if depth.ndim != 2:
         raise DataError(f"{file}: expected depth of rows and columns, got shape {depth.shape}")

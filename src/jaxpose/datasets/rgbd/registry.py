@@ -8,6 +8,7 @@ from typing import Literal, NamedTuple, get_args
 from jaxpose.datasets.images import INTRINSICS, found, some
 from jaxpose.datasets.rgbd import (
     arkitscenes,
+    azure_kinect,
     euroc,
     icl_nuim,
     nerfstudio,
@@ -28,6 +29,7 @@ from jaxpose.errors import DataError
 
 Format = Literal[
     "ros",
+    "azure_kinect",
     "record3d",
     "stray_scanner",
     "arkitscenes",
@@ -65,6 +67,13 @@ LAYOUTS: dict[Format, Layout] = {
         ros,
         ("topics",),
         "bags that rosbags writes",
+    ),
+    "azure_kinect": Layout(
+        "Azure Kinect (extra `video`)",
+        ("*.mkv",),
+        azure_kinect,
+        (),
+        "a made file in k4arecorder's layout",
     ),
     "record3d": Layout(
         "Record3D (extra `phone`)",

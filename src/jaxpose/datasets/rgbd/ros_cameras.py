@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxpose.datasets.rgbd.rational import pixel_rays, remapped, undistortion
 from jaxpose.datasets.rgbd.registration import register_depth
 from jaxpose.datasets.rgbd.ros_bag import Bag
 from jaxpose.datasets.rgbd.ros_frames import Tree
@@ -27,10 +28,10 @@ class View(NamedTuple):
 
 
 class _Lens(NamedTuple):
-    """The camera of a topic, and OpenCV's maps where its images have to be undistorted for it."""
+    """The camera of a topic, and the lens that has to be undone in its images for it."""
 
     camera: Camera
-    maps: tuple[np.ndarray, np.ndarray] | None  # column and row [px] to take each pixel from
+    coefficients: np.ndarray  # k1 k2 p1 p2 k3 k4 k5 k6 of what `Camera` has no model for, else none
     notes: tuple[str, ...]
 
 
@@ -58,11 +59,11 @@ def common_view(bag: Bag, tree: Tree, color: ImageTopic, depth: ImageTopic) -> V
     if depth.frame != color.frame or abs(width / height / (w / h) - 1) > _SAME_SHAPE:
         return _registered(bag, tree, color, depth, lens)
     if (w, h) == (width, height):
-        if lens.maps is None:
+        if not len(lens.coefficients):
             return View(lens.camera, Frame, lens.notes)
-        maps = lens.maps
-        return View(lens.camera, lambda rgb, z: Frame(_remap(rgb, maps), _remap(z, maps)), lens.notes)
-    if lens.maps is not None:
+        maps = undistortion(lens.camera, lens.coefficients)
+        return View(lens.camera, lambda rgb, z: Frame(remapped(rgb, maps), remapped(z, maps)), lens.notes)
+    if len(lens.coefficients):
         raise DataError(
             f"{bag.path}: {info}: expected {_BROWN[0]} with depth of another size, got {_RATIONAL}"
         )
@@ -82,13 +83,13 @@ def _registered(bag: Bag, tree: Tree, color: ImageTopic, depth: ImageTopic, lens
             f"{bag.path}: expected depth registered to colour, or what registers it, got {got}, no {lacking}"
         )
     of_depth = _lens(bag, other, depth)
-    if of_depth.maps is not None:
-        raise DataError(f"{bag.path}: {other}: expected a lens of {_BROWN[0]} for depth, got {_RATIONAL}")
+    rays = pixel_rays(of_depth.camera, of_depth.coefficients) if len(of_depth.coefficients) else None
     camera = lens.camera
     if width > 1.5 * w:  # else most pixels of colour would stay without depth
         camera = resized(camera, w, round(w * height / width))
-    register = register_depth(of_depth.camera, camera, T_color_depth)
-    color_of = lambda rgb: _resized(rgb if lens.maps is None else _remap(rgb, lens.maps), camera)
+    register = register_depth(of_depth.camera, camera, T_color_depth, rays=rays)
+    maps = undistortion(lens.camera, lens.coefficients) if len(lens.coefficients) else None
+    color_of = lambda rgb: _resized(rgb if maps is None else remapped(rgb, maps), camera)
     note = f"depth of {depth.frame} ({w}x{h}) registered to {color.frame}"
     note += f", colour resized to {camera.width}x{camera.height}" if camera.width != width else ""
     return View(camera, lambda rgb, z: Frame(color_of(rgb), register(z)), (*lens.notes, note))
@@ -96,8 +97,6 @@ def _registered(bag: Bag, tree: Tree, color: ImageTopic, depth: ImageTopic, lens
 
 def _lens(bag: Bag, topic: str, image: ImageTopic) -> _Lens:
     """The camera of a CameraInfo, of the size of its images."""
-    import cv2
-
     info, (width, height) = bag.first(topic), image.kind.size
     K, D, P = (np.array(_either(info, name), np.float64) for name in "KDP")
     model, where = str(info.distortion_model), f"{bag.path}: {topic}"
@@ -117,24 +116,14 @@ def _lens(bag: Bag, topic: str, image: ImageTopic) -> _Lens:
         (f"{topic} is of {size[0]}x{size[1]}, scaled to {width}x{height}",) if size != (width, height) else ()
     )
     if not D[5:].any():
-        return _Lens(camera, None, note)
-    K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
-    maps = cv2.initUndistortRectifyMap(K, D, np.eye(3), K, (width, height), cv2.CV_32FC1)
+        return _Lens(camera, np.zeros(0), note)
     undone = f"{topic}: the lens of {model} is undone in the images, which are a pinhole's"
-    return _Lens(camera._replace(distortion=()), (maps[0], maps[1]), (*note, undone))
+    return _Lens(camera._replace(distortion=()), D, (*note, undone))
 
 
 def _either(message: Any, name: str) -> Any:
     """A field whose name is upper case in ROS 1 and lower case in ROS 2."""
     return getattr(message, name) if hasattr(message, name) else getattr(message, name.lower())
-
-
-def _remap(image: np.ndarray, maps: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Colour is interpolated, depth is not."""
-    import cv2
-
-    how = cv2.INTER_LINEAR if image.ndim == 3 else cv2.INTER_NEAREST
-    return np.asarray(cv2.remap(image, *maps, how))
 
 
 def _resized(rgb: np.ndarray, camera: Camera) -> np.ndarray:

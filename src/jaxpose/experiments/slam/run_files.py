@@ -59,7 +59,14 @@ def write_run(
     on_update(Update("writing the map"))
     write_map(folder / "map.npz", SavedMap(result.map_config, *result.scene_params, result.keyframes))
     images_folder = "." if options.data is None else options.data.resolve()
-    write_camera(folder / "camera.json", recording.camera, recording.files, images_folder)
+    write_camera(
+        folder / "camera.json",
+        recording.camera,
+        recording.files,
+        images_folder,
+        depths=recording.depth_files,
+        depth_per_metre=recording.depth_per_metre,
+    )
     atomic.write_json(folder / "config.json", options)
     on_update(Update("writing the point cloud and the mesh"))
     notes = (*recording.notes, *first_pose(recording).notes, *_write_surface(folder, recording, result))
