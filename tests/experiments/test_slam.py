@@ -292,6 +292,10 @@ def test_imu_is_simulated_before_thinning(folder):
         (["--map.pixels", "9"], r"--map\.pixels: has no effect with --map\.method fused"),
         (["--no-loops", "--loop.drift", "2"], r"--loop\.drift: has no effect where no loops are looked for"),
         (["--features", "none", "--no-loops"], r"--loops: has no effect without features and a fused map"),
+        (
+            ["--map.method", "gradient", "--no-refine"],
+            r"--refine: has no effect with --track\.method or --map",
+        ),
         (["--loop.candidates", "0"], r"loop\.candidates: expected a .*number"),
         (["--map.sample.front", "9"], r"--map\.sample\.front: has no effect with --map\.method fused"),
         (["--track.sample.band", "1"], r"--track\.sample\.band: has no effect as the voxel sets it"),

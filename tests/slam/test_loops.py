@@ -16,9 +16,10 @@ from jaxpose.scenes.voxel_blocks import BlockConfig, sample_blocks
 from jaxpose.slam import SlamConfig, init
 from jaxpose.slam.config import LoopConfig
 from jaxpose.slam.keyframes import seen_shares
-from jaxpose.slam.loops.closure import corrected, followed, is_same_place
+from jaxpose.slam.loops.closure import corrected, followed, is_same_place, poses_by_motions
 from jaxpose.slam.loops.drift import drift_to_last, may_be_doubled
-from jaxpose.slam.loops.rebuild import rebuilt_map
+from jaxpose.slam.loops.rebuild import posed, rebuilt_map
+from jaxpose.slam.loops.refine import refined
 from jaxpose.slam.loops.types import no_loops
 from jaxpose.slam.loops.verify import Comparison, Verified, verify
 from jaxpose.slam.map.backend import seen_points
@@ -89,6 +90,18 @@ def test_frames_follow_the_keyframes_around_them():
     assert (np.diff(found[2:7, 1, 3]) > 0).all()
 
 
+@pytest.mark.parametrize(("jump", "believed"), [(0.001, True), (0.05, False)])
+def test_a_camera_that_jumps_is_where_motions_lead(jump, believed):
+    """One motion of 3 mm, one sigma, differs from the poses by less, or by far more than that."""
+    state = walked(11)
+    T = state.frames.T_world_body.copy()
+    T[7:, 1, 3] += jump
+    state = state._replace(frames=state.frames._replace(T_world_body=T), settled=4)
+    found = poses_by_motions(state)
+    np.testing.assert_allclose(found, T if believed else state.frames.T_odometry, atol=1e-12)
+    np.testing.assert_array_equal(poses_by_motions(state._replace(settled=8)), T)  # that was before
+
+
 def test_a_wall_hides_what_is_behind_it():
     ahead = np.array([[0.0, 0.0, 3.0], [0.5, 0.2, 3.0], [0.0, 0.0, -3.0]])
     poses, depth = np.tile(np.eye(4), (2, 1, 1)), np.full((2, 12, 16), 3.0)
@@ -156,8 +169,9 @@ def test_loops_straighten_a_bent_run_and_its_map(again):
     bend = rigid.exp(np.linspace(0, 1, count)[:, None] * np.array([0.15, -0.1, 0.08, 0.03, -0.02, 0.04]))
     bent = frames._replace(T_world_body=bend @ frames.T_world_body, T_odometry=bend @ frames.T_world_body)
     state = state._replace(frames=bent)
-    state = state._replace(map=rebuilt_map(state, recording.read))
     keyframes, lap, loops = np.flatnonzero(frames.keyframe), 12.5 / 2, state.loops
+    at_keyframes = (posed(state, recording.read(i), i) for i in keyframes.tolist())
+    state = state._replace(map=rebuilt_map(state, at_keyframes))
     for b in keyframes[recording.t[keyframes] > lap + 0.2][::4]:
         a = int(keyframes[np.argmin(np.abs(recording.t[keyframes] - recording.t[b] + lap))])
         images, seen = pairs(recording, a, int(b))
@@ -178,3 +192,29 @@ def test_loops_straighten_a_bent_run_and_its_map(again):
     assert ate_bent > 0.05 and ate < 0.02 and ate < ate_bent / 4
     assert wall < 0.01
     assert fixed.settled == count - 1 and fixed.loops.believed.all()
+
+
+@pytest.mark.slow
+@pytest.mark.optimised
+def test_frames_in_doubt_are_found_between_their_neighbours_at_the_end(again):
+    recording, state = again
+    frames, count = state.frames, state.frames.count
+    doubted = np.array([20, 21, 22, count - 1])
+    T, status = frames.T_world_body.copy(), frames.status.copy()
+    T[doubted, :3, 3] += [0.2, -0.2, 0.1]
+    status[doubted] = TrackingStatus.APPEARANCE_OUTLIER
+    off = np.random.default_rng(0).normal(size=(count, 6)) * ([0.004] * 3 + [0.001] * 3)
+    T[1:] = T[1:] @ rigid.exp(off[1:])
+    moved = state._replace(frames=frames._replace(T_world_body=T, status=status.astype(np.int8)))
+    found = refined(moved, recording.read).frames
+    error = lambda T: np.linalg.norm((T @ recording.T_body_cam - recording.T_world_cam)[:, :3, 3], axis=1)
+    assert (found.status[doubted[:-1]] <= TrackingStatus.WEAK).all() and error(found.T_world_body)[
+        20:23
+    ].max() < 0.03
+    np.testing.assert_array_equal(found.T_world_body[-1], T[-1])  # there is no frame after it
+    assert found.status[-1] == TrackingStatus.APPEARANCE_OUTLIER
+    motions = lambda T: rigid.inverse(T[:-1]) @ T[1:]
+    true = motions(recording.T_world_cam)
+    off = lambda T: rigid.log(rigid.inverse(true) @ motions(T @ recording.T_body_cam))
+    assert np.median(np.abs(off(found.T_world_body))) < 0.5 * np.median(np.abs(off(T)))
+    np.testing.assert_array_equal(moved.frames.T_world_body, T)  # the state stays usable

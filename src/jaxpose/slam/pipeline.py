@@ -27,6 +27,7 @@ from jaxpose.slam.config import SlamConfig
 from jaxpose.slam.initial_pose import first_pose, upright_pose
 from jaxpose.slam.keyframes import FrameReader, coarse_depth, keyframe_images, thumbnail
 from jaxpose.slam.loops.closure import with_loops
+from jaxpose.slam.loops.refine import refined
 from jaxpose.slam.loops.types import Loops, no_loops
 from jaxpose.slam.map.backend import (
     as_blocks,
@@ -183,6 +184,8 @@ def step(
 def finish(state: SlamState) -> SlamResult:
     """The whole run so far: its poses, its map with fine colour, one continuous field through all poses.
 
+    Frames are not registered again, as `run` does at its end: only the images of keyframes are kept.
+
     Args:
         state: a run of at least two frames, made by `step`; it stays usable.
 
@@ -200,6 +203,8 @@ def run(
 ) -> SlamResult:
     """Track every frame of an RGB-D recording and map what it sees (Ma et al. 2024, section 3.4).
 
+    At its end frames are registered once more, to the map of all of them (`config.refine`).
+
     Args:
         recording: frames with times, and what is known beside them. The world's frame is that of its first
             true pose, or upright by its accelerometer; `gravity_world` is in it.
@@ -211,7 +216,10 @@ def run(
         DataError: where the recording cannot be tracked: fewer than two frames, no depth in the first, an IMU
             asked for and not there.
     """
-    return _finish(track_all(recording, config, on_frame, state), recording.read, recording.imu)
+    state = track_all(recording, config, on_frame, state)
+    if config.uses_refinement:
+        state = refined(state, recording.read)
+    return _finish(state, recording.read, recording.imu)
 
 
 def track_all(

@@ -93,6 +93,33 @@ def next_pose(
     return _update_state(state, frames, predicted, by_motion, tracked, status)
 
 
+def registered_near(
+    state: SlamState,
+    i: int,
+    T_world_body: Float[np.ndarray, "4 4"],
+    sigma: Float[np.ndarray, "2"],
+    image: Image,
+) -> Tracked:
+    """A frame of a run registered to the map as it is now; the motion is that from the frame before it.
+
+    Args:
+        state: a run.
+        i: the frame, not the first.
+        T_world_body: where it may be.
+        sigma: how far off [m, rad] that may be.
+        image: of the frame.
+
+    Returns:
+        The registration.
+    """
+    frames = Frames(*(values[: i + 1] for values in state.frames))
+    state = state._replace(frames=frames)
+    T_ref_body = rigid.inverse(frames.T_world_body[i - 1]) @ T_world_body
+    expected = constant_velocity(expected_motion(state), T_ref_body, np.diag(np.repeat(sigma**2, 3)))
+    generator, key = np.random.default_rng([state.config.seed, i]), jax.random.key(state.config.seed)
+    return _track(state, frames, expected, image, generator, jax.random.fold_in(key, i))
+
+
 def unrolled(state: SlamState, predicted: MotionPrediction, frame: Frame) -> Frame:
     """The state's last frame, all of it at its first row's time, by the speed that is expected there."""
     if state.config.line_delay_us == 0:

@@ -17,13 +17,15 @@ from jaxpose.geometry import rigid
 from jaxpose.slam.config import LoopConfig
 from jaxpose.slam.keyframes import FrameReader, seen_shares, unlikeness
 from jaxpose.slam.loops.drift import drift_to_last, may_be_doubled, motion_sigmas
-from jaxpose.slam.loops.rebuild import rebuilt_map
+from jaxpose.slam.loops.rebuild import posed, rebuilt_map
 from jaxpose.slam.loops.verify import Verified, verify
 from jaxpose.slam.map.backend import seen_points
 from jaxpose.slam.tracking.features import locate_camera
 from jaxpose.slam.types import Frames, SlamState
 
 _LEAST_SIGMA = 1e-5  # [m, rad] of a motion
+_SAME = 1e-6  # [m, rad] by which a motion may differ from the poses that it leads to
+_JUMP = 3.0  # sigmas of the motions' drift from which poses have jumped
 
 
 def with_loops(state: SlamState, frame: Frame, read: FrameReader) -> SlamState:
@@ -135,9 +137,7 @@ def _settled(state: SlamState, frame: Frame, read: FrameReader) -> SlamState:
     if len(asked) < 2:
         return state
     assert state.grid is not None and state.features is not None
-    # Where motions since then lead, whatever the map that the camera was registered to said.
-    since = rigid.inverse(frames.T_odometry[c]) @ frames.T_odometry[c:]
-    T = np.concatenate([frames.T_world_body[:c], frames.T_world_body[c] @ since]) @ state.T_body_cam
+    T = poses_by_motions(state) @ state.T_body_cam
     correction = T[loops.a[asked]] @ loops.T_a_b[asked] @ rigid.inverse(T[loops.b[asked]])
     place, depth = T[loops.b[asked[-1]]], state.features.usual_depth
     first, last = rigid.inverse(place) @ correction @ place
@@ -148,6 +148,36 @@ def _settled(state: SlamState, frame: Frame, read: FrameReader) -> SlamState:
     if min(size(first), size(last)) > state.grid.voxel:
         return corrected(state, frame, read)
     return state._replace(settled=frames.count - 1)
+
+
+def poses_by_motions(state: SlamState) -> Float[np.ndarray, "n 4 4"]:
+    """Poses of the body: since loops were settled, where motions lead, if the camera has jumped from there.
+
+    A camera that is registered to the map of another time jumps; what differs less from motions that are of
+    two images each (`with_loops`) is their own drift.
+
+    Args:
+        state: a run whose last frame is a keyframe.
+
+    Returns:
+        (n, 4, 4) `T_world_body` of all frames.
+    """
+    frames, c = state.frames, state.settled
+    T, odometry = frames.T_world_body, frames.T_odometry
+    keyframes = np.flatnonzero(frames.keyframe)
+    since = keyframes[keyframes >= c]
+    motions = rigid.inverse(odometry[since[:-1]]) @ odometry[since[1:]]
+    off = rigid.log(rigid.inverse(motions) @ rigid.inverse(T[since[:-1]]) @ T[since[1:]])
+    other = np.flatnonzero(np.abs(off).max(axis=1) > _SAME)
+    if not len(other):
+        return T
+    start = since[other[0]]
+    drift, k = drift_to_last(state, keyframes), np.searchsorted(keyframes, start)
+    jump = rigid.log(rigid.inverse(odometry[-1]) @ odometry[start] @ rigid.inverse(T[start]) @ T[-1])
+    metres, radians = np.linalg.norm(jump.reshape(2, 3), axis=1)
+    if metres < _JUMP * drift.translation[k] and radians < _JUMP * drift.rotation[k]:
+        return T
+    return np.concatenate([T[:c], T[c] @ rigid.inverse(odometry[c]) @ odometry[c:]])
 
 
 def corrected(state: SlamState, frame: Frame | None, read: FrameReader) -> SlamState:
@@ -173,7 +203,8 @@ def corrected(state: SlamState, frame: Frame | None, read: FrameReader) -> SlamS
     last, loops = frames.count - 1, state.loops._replace(believed=believed)
     state = state._replace(frames=after, motion=motion, loops=loops, settled=last)
     now = read if frame is None else lambda i: frame if i == last else read(i)
-    return state._replace(map=jax.block_until_ready(rebuilt_map(state, now)))
+    made = rebuilt_map(state, (posed(state, now(i), i) for i in keyframes.tolist()))
+    return state._replace(map=jax.block_until_ready(made))
 
 
 def _edges(state: SlamState, keyframes: Int[np.ndarray, " k"]) -> Edges:

@@ -1,12 +1,16 @@
-"""The map made anew from all keyframes, at the poses that they have by now."""
+"""The map made anew from frames at the poses that they have by now."""
+
+from collections.abc import Iterable
+from itertools import islice
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from jaxpose.datasets.types import Frame
 from jaxpose.geometry import rigid
 from jaxpose.scenes.voxel_blocks import BlockConfig, Blocks, empty_blocks
-from jaxpose.slam.keyframes import FrameReader
 from jaxpose.slam.map.backend import allocation_points, map_backend
 from jaxpose.slam.map.integrate import grown_map
 from jaxpose.slam.map.photometric import MapState
@@ -14,15 +18,23 @@ from jaxpose.slam.observation import to_device
 from jaxpose.slam.rolling_shutter import at_first_row
 from jaxpose.slam.types import SlamState
 
-_TOGETHER = 16  # keyframes that room is made for at once
+_TOGETHER = 16  # frames that room is made for at once
 
 
-def rebuilt_map(state: SlamState, read: FrameReader) -> MapState:
-    """The map that integrating all keyframes at their poses makes, in a pool as large as the old one.
+class Posed(NamedTuple):
+    """A frame, what its colours are multiplied by, and where it was taken from."""
+
+    frame: Frame
+    exposure: Float[np.ndarray, "3"]
+    T_world_cam: Float[np.ndarray, "4 4"]
+
+
+def rebuilt_map(state: SlamState, frames: Iterable[Posed]) -> MapState:
+    """The map that integrating some frames makes, in a pool as large as the old one.
 
     Args:
         state: a run that maps by integration.
-        read: keyframes.
+        frames: what to integrate; a few of them are held at a time.
 
     Returns:
         The map; nothing is compiled for it, unless it needs more room than before.
@@ -30,23 +42,38 @@ def rebuilt_map(state: SlamState, read: FrameReader) -> MapState:
     assert isinstance(state.grid, BlockConfig) and state.map is not None
     old: Blocks = state.map.params
     room = {"capacity": old.values.shape[0], "side": old.table.shape[0]}
-    made = MapState(empty_blocks(state.grid, **room), ())
-    update, T_world_cam = map_backend(state).update, state.frames.T_world_body @ state.T_body_cam
-    keyframes = np.flatnonzero(state.frames.keyframe).tolist()
-    for some in (keyframes[k : k + _TOGETHER] for k in range(0, len(keyframes), _TOGETHER)):
-        frames = [_global_shutter(state, read(i), i) for i in some]
-        measured = [
-            allocation_points(f, state.camera, T_world_cam[i]) for f, i in zip(frames, some, strict=True)
-        ]
+    made, update, left = (
+        MapState(empty_blocks(state.grid, **room), ()),
+        map_backend(state).update,
+        iter(frames),
+    )
+    while some := list(islice(left, _TOGETHER)):
+        measured = [allocation_points(x.frame, state.camera, x.T_world_cam) for x in some]
         made = grown_map(state.grid, made, np.concatenate(measured))
-        for frame, i in zip(frames, some, strict=True):
-            image = to_device(frame)._replace(exposure=jnp.asarray(state.frames.exposure[i], jnp.float32))
-            made = update(made, image, jnp.asarray(T_world_cam[i], jnp.float32))
+        for x in some:
+            image = to_device(x.frame)._replace(exposure=jnp.asarray(x.exposure, jnp.float32))
+            made = update(made, image, jnp.asarray(x.T_world_cam, jnp.float32))
     return made
 
 
+def posed(state: SlamState, frame: Frame, i: int) -> Posed:
+    """A frame of a run as it is integrated, all rows at the first one's time by the motion around it.
+
+    Args:
+        state: a run.
+        frame: one of its frames, as read.
+        i: which of them.
+
+    Returns:
+        The frame with its pose.
+    """
+    frames = state.frames
+    T_world_cam = frames.T_world_body[i] @ state.T_body_cam
+    return Posed(_global_shutter(state, frame, i), frames.exposure[i], T_world_cam)
+
+
 def _global_shutter(state: SlamState, frame: Frame, i: int) -> Frame:
-    """A keyframe with all rows at the first one's time, by the motion around it."""
+    """A frame with all rows at the first one's time, by the motion around it."""
     if state.config.line_delay_us == 0:
         return frame
     frames, last = state.frames, state.frames.count - 1

@@ -1,0 +1,94 @@
+"""The end of a run: frames are registered once more, to the map that all of them made, and it is made anew.
+
+While a run goes on, a frame is registered to what was mapped before it, and a loop moves it only along with
+its keyframes. A frame in doubt was registered beside its place, or not at all: it is looked for between the
+frames around it that are in none.
+"""
+
+import jax
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxpose.datasets.types import Frame
+from jaxpose.geometry import rigid
+from jaxpose.slam.keyframes import FrameReader
+from jaxpose.slam.loops.rebuild import posed, rebuilt_map
+from jaxpose.slam.observation import to_device
+from jaxpose.slam.tracker import registered_near
+from jaxpose.slam.tracking.register import Tracked
+from jaxpose.slam.types import Frames, SlamState, TrackingStatus
+
+_OFF = 0.02, 0.01  # [m, rad] one sigma of a pose that is in no doubt
+_FASTER = 0.1  # [m/s, rad/s] one sigma of the speed between frames that are in none
+_FOUND = "loss", "depth_error", "colour_error", "valid", "sigma"  # of a registration
+
+
+def refined(state: SlamState, read: FrameReader) -> SlamState:
+    """The run after all its frames, with poses and a map that agree.
+
+    Args:
+        state: a run that maps by integration.
+        read: all of its frames.
+
+    Returns:
+        The state. Frames that were in doubt and are found are so no more.
+    """
+    frames, known = state.frames, np.flatnonzero(~state.frames.doubted)
+
+    def registered():
+        nonlocal frames
+        for i in range(frames.count):
+            seen = posed(state, read(i), i)
+            frames = _again(state, frames, i, known, seen.frame)
+            if frames.mapped[i]:
+                yield seen._replace(T_world_cam=frames.T_world_body[i] @ state.T_body_cam)
+
+    made = jax.block_until_ready(rebuilt_map(state, registered()))
+    return state._replace(frames=frames, map=made)
+
+
+def _again(state: SlamState, frames: Frames, i: int, known: Int[np.ndarray, " n"], frame: Frame) -> Frames:
+    """The frames with one of them registered to the map of `state`, if that is good; the first one stays."""
+    guess = _guess(state.frames, i, known)
+    if i == 0 or guess is None:
+        return frames
+    T_world_body, sigma = guess
+    tracked = registered_near(state, i, T_world_body, sigma, to_device(frame))
+    if not _is_good(state, i, known, tracked):
+        return frames
+    weak = (np.asarray(tracked.sigma) > state.config.recovery.weak).any()
+    pose = state.frames.T_world_body[i - 1] @ np.asarray(tracked.T_ref_body, np.float64)
+    pose[:3, :3] = rigid.nearest_rotation(pose[:3, :3])
+    status = TrackingStatus.WEAK if weak else TrackingStatus.TRACKED
+    found = {name: getattr(tracked, name) for name in _FOUND}
+    return frames.put(i, T_world_body=pose, status=status, **found)
+
+
+def _guess(
+    frames: Frames, i: int, known: Int[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "2"]] | None:
+    """Where a frame may be, and how far off [m, rad] that is: its pose, or between those of known frames."""
+    if not frames.doubted[i]:
+        return frames.T_world_body[i], np.array(_OFF)
+    after = int(np.searchsorted(known, i))
+    if after == len(known):
+        return None
+    a, b, t, T = known[after - 1], known[after], frames.t, frames.T_world_body
+    share = (t[i] - t[a]) / (t[b] - t[a])
+    between = T[a] @ rigid.exp(share * rigid.log(rigid.inverse(T[a]) @ T[b]))
+    return between, np.array(_OFF) + _FASTER * min(t[i] - t[a], t[b] - t[i])
+
+
+def _is_good(state: SlamState, i: int, known: Int[np.ndarray, " n"], tracked: Tracked) -> bool:
+    """Whether a registration explains its frame: as well as before or, of one in doubt, as others are."""
+    frames, policy = state.frames, state.config.recovery
+    if not np.isfinite(tracked.T_ref_body).all() or not np.isfinite(tracked.loss):
+        return False
+    usual = lambda values: float(np.nanmedian(values[known]))
+    if not frames.doubted[i]:
+        return bool(tracked.valid >= state.config.track.minimum_valid)
+    return bool(
+        tracked.valid > policy.recognised_valid
+        and tracked.loss < policy.recognised_loss * max(usual(frames.loss), 1.0)
+        and tracked.colour_error < policy.worse_colour * max(usual(frames.colour_error), policy.least_colour)
+    )
