@@ -13,7 +13,7 @@ from jaxpose.evaluation import trajectory_error
 from jaxpose.geometry import rigid
 from jaxpose.geometry.camera import Camera
 from jaxpose.scenes.voxel_blocks import BlockConfig, sample_blocks
-from jaxpose.slam import SlamConfig, init
+from jaxpose.slam import SlamConfig, checkpoint, init
 from jaxpose.slam.config import LoopConfig
 from jaxpose.slam.keyframes import seen_shares
 from jaxpose.slam.loops.closure import corrected, followed, is_same_place, poses_by_motions
@@ -162,7 +162,7 @@ def test_the_same_place_is_known_and_another_is_not(again):
 
 @pytest.mark.slow
 @pytest.mark.optimised
-def test_loops_straighten_a_bent_run_and_its_map(again):
+def test_loops_straighten_a_bent_run_and_its_map(again, tmp_path):
     """Poses of a good run bent by 20 cm and 3 degrees over its way; two loops know nothing of that."""
     recording, state = again
     frames, count = state.frames, state.frames.count
@@ -192,6 +192,10 @@ def test_loops_straighten_a_bent_run_and_its_map(again):
     assert ate_bent > 0.05 and ate < 0.02 and ate < ate_bent / 4
     assert wall < 0.01
     assert fixed.settled == count - 1 and fixed.loops.believed.all()
+    checkpoint.save(tmp_path / "checkpoint.npz", fixed)
+    kept = checkpoint.load(tmp_path / "checkpoint.npz", recording, fixed.config)
+    for part in ("frames", "loops", "map", "settled"):
+        jax.tree.map(np.testing.assert_array_equal, getattr(kept, part), getattr(fixed, part))
 
 
 @pytest.mark.slow
