@@ -177,3 +177,11 @@ def test_gaps_are_no_clean_bill(tmp_path):
     file.write_text("\n".join([*lines, lines[-1]]))
     result = checked(tmp_path)
     assert named_tests(result) == ["missing readings"] and "2 of 3001 lines" in faults(result)
+
+
+def test_readings_a_century_apart_take_no_more_room_than_others(tmp_path):
+    folder = without_truth(euroc(tmp_path))
+    file = folder / "mav0/imu0/data.csv"
+    lines = file.read_text().splitlines()
+    file.write_text("\n".join([*lines, "4500000000000000000," + lines[-1].split(",", 1)[1]]))
+    assert "gaps" in " ".join(checked(folder).notes) + faults(checked(folder))

@@ -147,6 +147,15 @@ def test_an_image_has_no_more_pixels_than_its_file_can_hold(tmp_path):
                 pass
 
 
+def test_an_image_is_asked_for_no_more_than_its_file_holds(tmp_path):
+    file = tmp_path / "a.png"
+    Image.new("L", (3, 2)).save(file)
+    with untrusted._File(file) as stream:
+        assert stream.read(1 << 60) == file.read_bytes() and stream.read(1 << 60) == b""
+        stream.seek(1)
+        assert stream.read(3) == b"PNG" and stream.read() == file.read_bytes()[4:]
+
+
 def test_hdf5_allots_no_rows_that_it_does_not_hold(tmp_path):
     h5py = pytest.importorskip("h5py")
     with h5py.File(tmp_path / "a.h5", "w") as content:
@@ -157,6 +166,9 @@ def test_hdf5_allots_no_rows_that_it_does_not_hold(tmp_path):
     with untrusted.opened_hdf5(tmp_path / "a.h5", "events") as content:
         np.testing.assert_array_equal(untrusted.hdf5_column(content, "events/t")[:], np.arange(10))
         assert [untrusted.hdf5_column(content, f"events/{name}") for name in "ypz"] == [None] * 3
+        assert untrusted.hdf5_whole_number(content, "none", 3) == 3
+        with pytest.raises(ValueError, match="events/x that is no whole number"):
+            untrusted.hdf5_whole_number(content, "events/x", 3)
     with pytest.raises(
         DataError, match="a.h5: expected events, got 1000000000000 numbers of events/x in 0 b"
     ):

@@ -26,6 +26,7 @@ from typing import Any
 
 sys.path.insert(1, str(Path(__file__).parents[1]))  # what tests share
 SLOWEST_S, MOST_BYTES = 10.0, 1 << 30
+TOGETHER = 10_000  # cases of a process, whose memory grows
 DEAD_S, ASLEEP_S = 30.0, 600.0  # of the processor, and of the clock, after which a case is ended
 
 
@@ -100,7 +101,7 @@ def work(names: list[str], seed: int, first: int, seconds: float) -> None:
         _limit_memory()
         faulthandler.register(signal.SIGPROF, chain=True)  # then it ends the process
         copy, number = Path(where) / "case", first
-        while time.monotonic() < ends:
+        while time.monotonic() < ends and number < first + TOGETHER:
             name = names[number % len(names)]
             print(json.dumps({"case": number}), flush=True)
             shutil.copytree(originals[name], copy)

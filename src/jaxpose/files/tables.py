@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxpose.errors import DataError
+from jaxpose.files import timestamps
 from jaxpose.files.schema import FARTHEST_M
 from jaxpose.files.timestamps import POSES, Stamps, Steps, Unit, format_ns, to_decimal, to_stamps, units
 
@@ -142,12 +143,9 @@ def stamped_rows(
                 continue
             _check_after(path, lines[row], ns[kept[-1]], ns[row])
             kept.append(row)
-        lines, ns, values, stamps = (
-            [lines[k] for k in kept],
-            [ns[k] for k in kept],
-            values[kept],
-            stamps.rows(kept),
-        )
+        lines, ns = [lines[k] for k in kept], [ns[k] for k in kept]
+        values, stamps = values[kept], stamps.rows(kept)
+    timestamps.check_seconds(path, np.array([ns[0] / 10**9, ns[-1] / 10**9]))
     return StampedRows(lines, ns, values, unit, tuple(repeated), missing, stamps)
 
 

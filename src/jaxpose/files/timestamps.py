@@ -6,10 +6,14 @@ they become floats.
 
 from collections.abc import Sequence
 from decimal import Context, Decimal, InvalidOperation
+from pathlib import Path
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from jaxtyping import Float, Int
+
+from jaxpose.errors import DataError
+from jaxpose.files.schema import LATEST_S
 
 Unit = Literal["s", "ms", "us", "ns"]
 PER_SECOND: dict[Unit, int] = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}
@@ -179,6 +183,19 @@ def format_seconds(t: Float[np.ndarray, " n"], t0_ns: int) -> list[str]:
     if t0_ns == 0:
         return [repr(s) for s in t.tolist()]
     return [format_ns(timestamp) for timestamp in whole_ns(t, t0_ns)]
+
+
+def check_seconds(path: Path | str, t: Float[np.ndarray, " n"]) -> None:
+    """DataError naming a file for what is no time until the year 2200."""
+    bad = ~(np.abs(t) <= LATEST_S)
+    if bad.any():
+        raise DataError(f"{path}: expected timestamps until the year 2200, got {t[bad][0]:g} s")
+
+
+def nanoseconds(path: Path | str, t: Float[np.ndarray, " n"]) -> list[int]:
+    """Seconds of a file in whole ns; DataError naming it for what is no time until the year 2200."""
+    check_seconds(path, t)
+    return [round(s * 1e9) for s in t.tolist()]
 
 
 def format_ns(ns: int) -> str:

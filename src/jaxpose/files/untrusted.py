@@ -4,6 +4,7 @@ Nothing is unpickled. Whatever goes wrong inside becomes one `DataError` that na
 where there is one. `schema` checks what was read.
 """
 
+import io
 import json
 import math
 import os
@@ -224,6 +225,30 @@ def hdf5_column(content: Any, name: str, *, table: bool = False) -> Any:
     return column
 
 
+def hdf5_whole_number(content: Any, name: str, default: int) -> int:
+    """A whole number of an HDF5 file.
+
+    Args:
+        content: the open file.
+        name: of the data set.
+        default: where there is none.
+
+    Returns:
+        The number.
+
+    Raises:
+        ValueError: for what is no single whole number.
+    """
+    import h5py
+
+    if name not in content:
+        return default
+    column = content.get(name)
+    if not isinstance(column, h5py.Dataset) or column.size != 1 or column.dtype.kind not in "iu":
+        raise ValueError(f"{name} that is no whole number")
+    return int(column[()].item())
+
+
 # --- texts --------------------------------------------------------------------------------------------------
 
 
@@ -329,6 +354,17 @@ def _numeric(value: Any) -> Any:
 # --- images -------------------------------------------------------------------------------------------------
 
 
+class _File(io.BufferedReader):
+    """A file of which no more is asked than it holds: space for all that is asked is made first."""
+
+    def __init__(self, path: Path | str):
+        super().__init__(io.FileIO(path))
+        self._size = os.fstat(self.fileno()).st_size
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        return super().read(size if size is None else min(size, max(self._size - self.tell(), 0)))
+
+
 @contextmanager
 def opened_image(path: Path | str) -> Iterator[Any]:
     """Open an image, of which Pillow reads only the header until pixels are asked for.
@@ -346,7 +382,7 @@ def opened_image(path: Path | str) -> Iterator[Any]:
 
     if not os.path.isfile(path):
         raise DataError(f"{path}: expected an image, got nothing")
-    with reading(path, "an image"), Image.open(path, formats=_FORMATS) as image:
+    with reading(path, "an image"), _File(path) as stream, Image.open(stream, formats=_FORMATS) as image:
         width, height = image.size
         size = os.path.getsize(path)
         if not 0 < width * height <= min(_PIXELS, _PIXELS_PER_BYTE * size):

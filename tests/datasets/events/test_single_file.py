@@ -252,6 +252,7 @@ def test_csv_that_cannot_be_read(tmp_path):
         ("t,x,y,p\n1,2,3,0\n2,3,4\n", "e.csv:3: expected 4 numbers .t x y p., got 3"),
         ("1,2,3,0\n2,3,4,one\n", "e.csv:2: expected 4 numbers .t x y p., got '2,3,4,one'"),
         ("a,b\n", "e.csv:1: expected 4 numbers"),
+        ("t,a,x,y,p\n1,2,3,0\n", "e.csv:2: expected 4 numbers .t x y p., got '1,2,3,0'"),
         ("t,x,y,p\n", "e.csv: expected events, got none"),
         ("t,x,y,p\n1,2,3,7\n", "e.csv:2: expected polarities 0 and 1"),
     ):

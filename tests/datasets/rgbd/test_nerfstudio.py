@@ -73,3 +73,14 @@ def test_unusable_files_are_named(tmp_path, walk, save, header, frame, message):
     folder = write(tmp_path, walk, save, header=header, frame=lambda k: frame)
     with pytest.raises(DataError, match=f"transforms.json: {message}"):
         nerfstudio.load(folder)
+
+
+def test_numbers_that_no_float_holds_are_named(tmp_path, walk, save):
+    folder = write(tmp_path, walk, save, frame=lambda k: {"timestamp": 1e308 + k * 1e300})
+    with pytest.raises(
+        DataError, match=r"transforms.json: expected timestamps until the year 2200, got 1e\+308 s"
+    ):
+        nerfstudio.load(folder)
+    folder = write(tmp_path, walk, save, header={"cx": -1.7e308})  # the mean of two of them is infinite
+    with pytest.raises(DataError, match="expected a camera's fx fy cx cy, got 30 31 -inf 11"):
+        nerfstudio.load(folder)

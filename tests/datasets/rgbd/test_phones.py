@@ -86,6 +86,12 @@ def test_gaps_and_a_moving_focus_are_told(tmp_path, walk, save):
     [
         ("odometry.csv", "a,b\n1,2\n", "odometry.csv:2: expected timestamp, frame, x"),
         ("odometry.csv", "a,b\n", "odometry.csv: expected lines of timestamp"),
+        ("odometry.csv", "a\n1,inf,0,0,0,0,0,0,1\n", "odometry.csv: expected numbers of frames, got inf"),
+        (
+            "odometry.csv",
+            "a\n1e300,1,0,0,0,0,0,0,1\n",
+            "odometry.csv: expected timestamps until the year 2200",
+        ),
         ("camera_matrix.csv", "1, 2", "camera_matrix.csv: expected 9 numbers"),
         ("camera_matrix.csv", "60,0,90\n0,60,22\n0,0,1", "camera_matrix.csv: expected fx 0 cx .* in 64x48"),
         ("rgb.mp4", "no video", "rgb.mp4: expected a video"),
@@ -156,6 +162,10 @@ def only_metadata(path, content):
         ),
         (lambda p, w: phones.record3d(p, w, metadata={"K": [1]}), "a.r3d: K: expected 9 finite numbers"),
         (lambda p, w: phones.record3d(p, w, metadata={"poses": "x"}), "a.r3d: poses: expected"),
+        (
+            lambda p, w: phones.record3d(p, w, metadata={"frameTimestamps": [k * 1e300 for k in range(9)]}),
+            "a.r3d: expected timestamps until the year 2200, got 1e.300 s",
+        ),
         (lambda p, w: zipfile.ZipFile(p, "w").close(), "a.r3d: metadata: expected an entry"),
         (lambda p, w: only_metadata(p, b"[" * 100_000), "a.r3d: metadata: .*got nesting without end"),
     ],

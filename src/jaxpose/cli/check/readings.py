@@ -140,7 +140,7 @@ def _turned_error(
     t: Float[np.ndarray, " n"], omega: Float[np.ndarray, "n 3"], force: Float[np.ndarray, "n 3"]
 ) -> float:
     """Median difference between mean forces and those of 0.4 s earlier, turned as the rates say."""
-    grid = np.arange(t[0], t[-1], _STEP_S)
+    grid = np.arange(t[0], _end(t), _STEP_S)
     k = round(_TURN_S / _STEP_S)
     if len(grid) < 3 * k:
         return 0.0
@@ -156,7 +156,7 @@ def _in_the_world(
     t: Float[np.ndarray, " n"], omega: Float[np.ndarray, "n 3"], force: Float[np.ndarray, "n 3"]
 ) -> float:
     """Median length of means over 10 s of forces that are turned into one frame, as the rates say."""
-    grid = np.arange(t[0], t[-1], _STEP_S)
+    grid = np.arange(t[0], _end(t), _STEP_S)
     if len(grid) < 2:
         return np.inf
     rate, pull = _means(t, omega, grid), _means(t, force, grid)
@@ -179,8 +179,14 @@ def _sign(force_cam: Float[np.ndarray, "n 3"]) -> list[Finding]:
     return [Finding("warning", "gravity", found, "a specific force that points up", fix)]
 
 
+def _end(t: Float[np.ndarray, " n"]) -> float:
+    """Until when readings are tested [s]: no longer than one for each window would reach."""
+    return float(min(t[-1], t[0] + len(t) * _WINDOW_S))
+
+
 def _force(t: Float[np.ndarray, " n"], vectors: Float[np.ndarray, "n 3"]) -> _Force:
-    windows = np.linspace(t[0], t[-1], max(round((t[-1] - t[0]) / _WINDOW_S), 1) + 1)
+    end = _end(t)
+    windows = np.linspace(t[0], end, max(round((end - t[0]) / _WINDOW_S), 1) + 1)
     length = np.linalg.norm(_means(t, vectors, windows), axis=1)
     low, middle, high = np.quantile(length, [0.25, 0.5, 0.75])
     return _Force(float(middle), float((high - low) / max(middle, 1e-12)))

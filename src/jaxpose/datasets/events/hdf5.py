@@ -13,7 +13,7 @@ from jaxpose.datasets.images import only, some
 from jaxpose.datasets.types import EventRecording
 from jaxpose.errors import DataError
 from jaxpose.events import Mosaic
-from jaxpose.files.untrusted import hdf5_column, opened_hdf5
+from jaxpose.files.untrusted import hdf5_column, hdf5_whole_number, opened_hdf5
 
 _SUFFIXES = (".h5", ".hdf5")
 # What groups call the time, column, row and polarity of events, and the groups and tables that have them: of
@@ -115,7 +115,7 @@ def _file(path: Path) -> Path:
 def _blocks(file: Path) -> Iterator[Block]:
     with opened_hdf5(file, "an HDF5 file") as content:
         read, length = _columns(file, content) or _table(content) or _none(file, content)
-        offset = int(np.asarray(content.get("t_offset", 0)))
+        offset = hdf5_whole_number(content, "t_offset", 0)
         for start in range(0, length, BLOCK):
             t, *others = read(start, start + BLOCK)
             if t.dtype.kind in "iu":

@@ -36,6 +36,11 @@ class _Form(NamedTuple):
     size: tuple[int, int] | None
     named: bool  # whether a header names the columns
 
+    @property
+    def alone(self) -> bool:
+        """Whether lines hold the four columns and no others."""
+        return self.columns == 4 and max(self.order) < 4
+
 
 def text_stream(file: Path, unit: Unit | None) -> Stream:
     """The events of a text file, separated by blanks, commas or semicolons.
@@ -149,7 +154,7 @@ def _blocks(file: Path, form: _Form) -> Iterator[Block]:
                         delimiter=form.separator,
                         max_rows=BLOCK,
                         ndmin=1,
-                        usecols=form.order if form.columns != 4 else None,
+                        usecols=None if form.alone else form.order,
                     )
             except ValueError as error:
                 _name_line(file, form, error)
@@ -165,7 +170,7 @@ def _kind(file: Path, form: _Form) -> np.dtype:
         first = next((row for row in rows if len(row) > form.order[0]), ["0"] * 16)[form.order[0]].strip()
     whole = first.isdecimal() and len(first) > _EXACT_DIGITS
     names = ["t", "x", "y", "p"]
-    if form.columns == 4:  # loadtxt takes fields in the order of the columns
+    if form.alone:  # loadtxt takes fields in the order of the columns
         names = [names[form.order.index(k)] for k in range(4)]
     return np.dtype([(name, np.int64 if whole and name == "t" else np.float64) for name in names])
 
@@ -189,6 +194,6 @@ def _name_line(file: Path, form: _Form, error: ValueError) -> NoReturn:
             if fields and len(fields) != form.columns:
                 wanted = _COLUMNS if form.columns == 4 else f"{form.columns} columns, as the header has"
                 raise DataError(f"{file}:{number}: expected {wanted}, got {len(fields)}")
-            if fields and not _numbers([fields[k] for k in form.order]):
+            if fields and (max(form.order) >= len(fields) or not _numbers([fields[k] for k in form.order])):
                 raise DataError(f"{file}:{number}: expected {_COLUMNS}, got {line.strip()[:60]!r}")
     raise DataError(f"{file}: expected lines of {_COLUMNS}, got {error}")

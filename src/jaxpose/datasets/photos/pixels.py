@@ -52,7 +52,7 @@ class Pixels(NamedTuple):
 
 def stored_size(file: Path) -> tuple[tuple[int, int], int]:
     """Width and height of an image as its file has it, and its EXIF orientation (1: upright)."""
-    return open_image(file, lambda image: (image.size, _orientation(image)))
+    return open_image(file, lambda image: (image.size, _orientation(file, image)))
 
 
 def read_images(
@@ -178,10 +178,10 @@ def _by_area(image: Image.Image, size: tuple[int, int]) -> np.ndarray:
     return cv2.resize(np.asarray(image), size, interpolation=cv2.INTER_AREA)
 
 
-def _orientation(image: Image.Image) -> int:
+def _orientation(file: Path, image: Image.Image) -> int:
     # In a PNG it may stand behind the pixels, which Pillow decodes to look there.
     if isinstance(image, PngImageFile):
-        content = Path(str(image.filename)).read_bytes()
+        content = file.read_bytes()
         if not any(name in content for name in _PNG_ORIENTATIONS):
             return 1
     return int(image.getexif().get(ExifTags.Base.Orientation, 1))

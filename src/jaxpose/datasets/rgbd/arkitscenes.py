@@ -13,6 +13,7 @@ from jaxpose.datasets.rgbd.phones import UNSURE, middle, sure_by_file
 from jaxpose.datasets.types import Recording
 from jaxpose.errors import DataError
 from jaxpose.files.tables import read_all_numbers, read_stamped, seconds
+from jaxpose.files.timestamps import nanoseconds
 from jaxpose.files.trajectories import Trajectory
 from jaxpose.geometry import rigid
 
@@ -86,7 +87,7 @@ def _stamped(folder: Path) -> tuple[list[int], list[Path]]:
         name, _, stamp = file.stem.rpartition("_")
         if name and file.suffix.lower() in SUFFIXES:
             try:
-                by_time[round(float(stamp) * 1e9)] = file
+                by_time[nanoseconds(file, np.array([float(stamp)]))[0]] = file
             except ValueError:
                 raise DataError(
                     f"{file}: expected a name ID_T with a timestamp in seconds, got {stamp}"

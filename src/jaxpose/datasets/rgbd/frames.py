@@ -25,7 +25,7 @@ from jaxpose.datasets.images import (
 )
 from jaxpose.datasets.types import Frame, Recording
 from jaxpose.errors import DataError
-from jaxpose.files.schema import name_inside
+from jaxpose.files.schema import FARTHEST_M, name_inside
 from jaxpose.files.tables import seconds
 from jaxpose.geometry.camera import Camera, resized
 
@@ -266,7 +266,7 @@ def assembled(
     if not _same_shape(size, depth_size):
         raise DataError(f"{where}: expected {sizes[0]}, the size of {first_color}, got {sizes[1]}")
     camera, assumed = intrinsics(size, depth_size)
-    camera = camera if isinstance(camera, Camera) else Camera(*camera, *size)
+    camera = _checked(where, camera if isinstance(camera, Camera) else Camera(*camera, *size))
     to = None if size == depth_size else depth_size
     if to is not None:
         assumed = (f"colour resized from {' to '.join(sizes)}, the size of depth", *assumed)
@@ -288,6 +288,13 @@ def assembled(
         notes=(*notes, *assumed, *lacking),
         **known,
     )
+
+
+def _checked(where: Path | str, camera: Camera) -> Camera:
+    if not all(abs(number) < FARTHEST_M for number in camera[:4]):
+        got = " ".join(f"{number:g}" for number in camera[:4])
+        raise DataError(f"{where}: expected a camera's fx fy cx cy, got {got}")
+    return camera
 
 
 def _same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:

@@ -12,6 +12,7 @@ from jaxpose.datasets.rgbd.phones import middle
 from jaxpose.datasets.types import Recording
 from jaxpose.errors import DataError
 from jaxpose.files.schema import choice, numbers
+from jaxpose.files.timestamps import nanoseconds
 from jaxpose.files.untrusted import read_json, read_npy
 from jaxpose.geometry.camera import Camera
 
@@ -86,7 +87,7 @@ def load(path: Path | str, *, rate_hz: float = 30.0) -> Recording:
     note = f"{len(lacking)} of {len(frames)} frames left out, without colour or depth: {some(lacking)}"
     t: Any = frame_times(range(len(rows)), rate_hz)
     if stamps is not None:
-        t = [round(float(stamps[row]) * 1e9) for row in rows]
+        t = nanoseconds(file, stamps[rows])
     used = [frames[row] for row in rows]
     poses = np.stack([_pose(file, frame) for frame in used]) @ OPENGL
     per_metre = 1000.0

@@ -11,6 +11,7 @@ from jaxpose.datasets.rgbd.phones import UNSURE, Y_UP, middle, sure_by_file
 from jaxpose.datasets.types import Recording
 from jaxpose.errors import DataError
 from jaxpose.files.schema import numbers
+from jaxpose.files.timestamps import nanoseconds
 from jaxpose.files.untrusted import read_json
 
 _LAYOUT = "keyframes/images/N.jpg, keyframes/depth/N.png and keyframes/cameras/N.json"
@@ -60,7 +61,7 @@ def load(path: Path | str, *, rate_hz: float = 30.0) -> Recording:
     poses, intrinsics, sizes = (np.stack(column) for column in zip(*map(_camera, files), strict=True))
     confidence = root / "confidence"
     notes = [*pairs.notes, *([UNSURE] if confidence.is_dir() else [])]
-    t, timed = _times(pairs.numbers, rate_hz)
+    t, timed = _times(root, pairs.numbers, rate_hz)
 
     def camera(size: tuple[int, int], depth_size: tuple[int, int]) -> tuple[Pinhole, tuple[str, ...]]:
         for file, stated in zip(files, sizes, strict=True):
@@ -92,10 +93,11 @@ def _camera(file: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return T @ OPENGL, np.append(get("fx", "fy", above=0), get("cx", "cy")), get("width", "height")
 
 
-def _times(frames: list[int], rate_hz: float) -> tuple[np.ndarray | list[int], tuple[str, ...]]:
+def _times(root: Path, frames: list[int], rate_hz: float) -> tuple[np.ndarray | list[int], tuple[str, ...]]:
     """Timestamps [ns] if the names are some, else seconds, and a note on what they were taken for."""
     step = float(np.median(np.diff(frames))) if len(frames) > 1 else 0.0
     for unit, seconds in _UNITS.items():
         if _STEPS_S[0] < step * seconds < _STEPS_S[1] and step > 10:
-            return [round(n * seconds * 1e9) for n in frames], (f"took the names for timestamps in {unit}",)
+            note = f"took the names for timestamps in {unit}"
+            return nanoseconds(root, np.array(frames) * seconds), (note,)
     return frame_times(range(len(frames)), rate_hz), ("names are no timestamps: took frames in their order",)

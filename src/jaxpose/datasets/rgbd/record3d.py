@@ -19,6 +19,7 @@ from jaxpose.datasets.rgbd.phones import UNSURE, Y_UP, middle, sure
 from jaxpose.datasets.types import Recording
 from jaxpose.errors import DataError
 from jaxpose.files.schema import numbers
+from jaxpose.files.timestamps import nanoseconds
 from jaxpose.files.untrusted import json_object, read_json, reading
 from jaxpose.geometry import rigid
 from jaxpose.geometry.camera import Camera, resized
@@ -155,7 +156,10 @@ def _plane(source: _Source, name: str, kind: np.dtype, shape: tuple[int, int]) -
         with reading(f"{source.path}: {name}", "LZFSE"):
             if (there := _unpacked_size(data)) != size:  # the package allots whatever a damaged one fills
                 raise ValueError(f"{there} bytes, not {size}")
-            data = lzfse.decompress(data)
+            try:
+                data = lzfse.decompress(data)
+            except MemoryError:  # so the package calls damage
+                raise ValueError("damaged blocks") from None
     if len(data) != size:
         wanted = f"{shape[1]}x{shape[0]} of {kind.name}, {size} bytes"
         raise DataError(f"{source.path}: {name}: expected {wanted}, got {len(data)}")
@@ -212,6 +216,6 @@ def _times(source: _Source, frames: list[int]) -> list[int]:
         stated = numbers(path, content, "frameTimestamps", (None,))
         if len(stated) <= frames[-1] or (np.diff(stated[frames]) <= 0).any():
             raise DataError(f"{path}: frameTimestamps: expected one a frame, increasing, got {len(stated)}")
-        return [round(t * 1e9) for t in stated[frames].tolist()]
+        return nanoseconds(path, stated[frames])
     fps = float(numbers(path, content, "fps", above=0))
-    return [round(frame / fps * 1e9) for frame in frames]
+    return nanoseconds(path, np.array(frames) / fps)

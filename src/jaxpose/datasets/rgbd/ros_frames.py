@@ -104,7 +104,7 @@ def stamp_ns(header: Any) -> int:
 def pose_matrix(position: Any, orientation: Any) -> Float[np.ndarray, "4 4"]:
     """A pose of ROS as a matrix, NaN for a quaternion that is none."""
     q = np.array([orientation.x, orientation.y, orientation.z, orientation.w], np.float64)
-    if not np.isfinite(q).all() or np.linalg.norm(q) < 1e-6:
+    if not 1e-6 < np.linalg.norm(q) < 1e6:
         return np.full((4, 4), np.nan)
     return rigid.make(
         Rotation.from_quat(q).as_matrix(), np.array([position.x, position.y, position.z], float)

@@ -13,12 +13,14 @@ from jaxpose.datasets.types import Recording
 from jaxpose.datasets.video import Video
 from jaxpose.errors import DataError
 from jaxpose.files.tables import numbered_lines, read_all_numbers
+from jaxpose.files.timestamps import nanoseconds
 from jaxpose.geometry import rigid
 from jaxpose.imu import Imu
 
 _LAYOUT = "rgb.mp4, depth/N.png, odometry.csv and camera_matrix.csv"
 _STANDARD_GRAVITY = 9.80665  # [m/s^2] in a g of the phone's accelerometer
 _IS_ONE = (0.7, 1.3)  # what is gravity's norm, of g
+_MOST_FRAMES = 1e9
 
 
 def detect(path: Path) -> bool:
@@ -114,7 +116,9 @@ def _odometry(file: Path) -> tuple[list[int], list[int], Float[np.ndarray, "n c"
     later = np.append(True, table[1:, 0] > np.maximum.accumulate(table[:, 0])[:-1])
     note = f"{(~later).sum()} rows of odometry.csv left out, of a timestamp not after those before"
     table, notes = table[later], () if later.all() else (note,)
-    return [round(t * 1e9) for t in table[:, 0].tolist()], [int(n) for n in table[:, 1]], table[:, 2:], notes
+    if (odd := table[~(np.abs(table[:, 1]) < _MOST_FRAMES), 1]).size:
+        raise DataError(f"{file}: expected numbers of frames, got {odd[0]:g}")
+    return nanoseconds(file, table[:, 0]), table[:, 1].astype(int).tolist(), table[:, 2:], notes
 
 
 def _poses(table: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "n 4 4"]:
