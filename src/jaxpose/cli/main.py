@@ -34,6 +34,7 @@ _GROUPS = {
         "fit": _Subcommand("jaxpose.cli.fit.command", "compare pose fields on a trajectory"),
         "eval": _Subcommand("jaxpose.cli.evaluate", "errors of a trajectory against a reference"),
         "export": _Subcommand("jaxpose.cli.export", "write the trajectory of a run in another format"),
+        "convert": _Subcommand("jaxpose.cli.convert", "copy a recording into a folder of image files"),
         "view": _Subcommand("jaxpose.cli.view.command", "show a run in the browser, or save it as a page"),
     },
 }

@@ -8,6 +8,7 @@ from jaxpose.files.trajectories import Trajectory
 from jaxpose.imu.simulation import interpolant
 
 _MOST_GAP_S = 0.1  # between two true poses that one is interpolated from
+_ROUNDED_S = 1e-9  # of a timestamp as float64, beyond the first or last pose
 _AT_A_STAMP_S = 1e-3  # so close to a true pose, no other needs to be near
 
 
@@ -22,6 +23,7 @@ def poses_at(ground_truth: Trajectory, t: Float[np.ndarray, " n"]) -> Float[np.n
     after = np.clip(np.searchsorted(ground_truth.t, t), 1, len(ground_truth.t) - 1)
     gap = ground_truth.t[after] - ground_truth.t[after - 1]
     known = (gap <= _MOST_GAP_S) | (np.abs(ground_truth.t[nearest(t, ground_truth.t)] - t) <= _AT_A_STAMP_S)
-    inside = (t >= ground_truth.t[0]) & (t <= ground_truth.t[-1]) & known
-    poses[inside] = interpolant(ground_truth.t, ground_truth.T).pose(t[inside])
+    asked = np.clip(t, *ground_truth.t[[0, -1]])
+    inside = (np.abs(asked - t) < _ROUNDED_S) & known
+    poses[inside] = interpolant(ground_truth.t, ground_truth.T).pose(asked[inside])
     return poses

@@ -16,7 +16,14 @@ from jaxpose.errors import DataError
 
 _MOST = 500_000  # events that are looked at: recordings have hundreds of millions
 _RATES_HZ = (1e2, 1e9)
-_NAMES = {"eventnerf": "EventNeRF", "davis": "DAVIS", "hdf5": "HDF5", "npz": "npz", "file": "file of"}
+_NAMES = {
+    "eventnerf": "EventNeRF",
+    "davis": "DAVIS",
+    "hdf5": "HDF5",
+    "npz": "npz",
+    "file": "file of",
+    "ros": "ROS bag of",
+}
 
 
 def find_events(path: Path) -> event_registry.Format | None:

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Literal, NamedTuple, Protocol, get_args
 
-from jaxpose.datasets.events import davis, eventnerf, single_file
+from jaxpose.datasets.events import davis, eventnerf, ros, single_file
 from jaxpose.datasets.events import hdf5 as event_hdf5
 from jaxpose.datasets.events import npz as event_npz
 from jaxpose.datasets.events.sidecar import Source
@@ -13,7 +13,7 @@ from jaxpose.datasets.types import EventRecording
 from jaxpose.errors import DataError
 from jaxpose.events import Mosaic
 
-Format = Literal["eventnerf", "davis", "hdf5", "npz", "file"]
+Format = Literal["eventnerf", "davis", "hdf5", "npz", "file", "ros"]
 
 
 class _Module(Protocol):
@@ -51,6 +51,7 @@ _LAYOUTS: dict[Format, _Layout] = {
     "hdf5": _Layout("an HDF5 file", (".h5", ".hdf5"), event_hdf5, "mono"),
     "npz": _Layout("an npz file with x y t p", (".npz",), event_npz, "mono"),
     "file": _Layout("a RAW, DAT, AEDAT 4, ES or csv file", single_file.SUFFIXES, single_file, "mono"),
+    "ros": _Layout("a ROS bag with events", (), ros, "mono"),
 }
 
 
@@ -69,7 +70,7 @@ def find_format(path: Path | str) -> Format:
     path = Path(path)
     for name in get_args(Format):
         layout = _LAYOUTS[name]
-        if path.is_dir() and layout.module.detect(path):
+        if (path.is_dir() or name == "ros") and layout.module.detect(path):
             return name
         if path.is_file() and path.suffix.lower() in layout.suffixes:
             return name

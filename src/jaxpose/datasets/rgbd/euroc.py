@@ -38,7 +38,7 @@ from jaxpose.datasets.types import Frame, Recording
 from jaxpose.errors import DataError
 from jaxpose.files.ply import read_points
 from jaxpose.files.tables import left_out_notes, seconds
-from jaxpose.files.trajectories import Trajectory
+from jaxpose.files.trajectories import Trajectory, read_trajectory, since
 from jaxpose.geometry import rigid
 from jaxpose.geometry.camera import Camera
 from jaxpose.imu import Imu, ImuNoise
@@ -264,10 +264,10 @@ def _truth_at(
     if not (mav0 / "state_groundtruth_estimate0").is_dir():
         none = np.full((len(stamps_ns), 4, 4), np.nan)
         return none, ("no state_groundtruth_estimate0: there is no ground truth to compare with",), ()
+    found = read_trajectory(existing(mav0 / "state_groundtruth_estimate0" / "data.csv"))
     t0_ns = stamps_ns[0]
-    ground_truth = load_truth(mav0, t0_ns)
-    trajectory = Trajectory(ground_truth.t, ground_truth.T_world_body)
-    return poses_at(trajectory, seconds(stamps_ns, t0_ns)), (), ground_truth.notes
+    trajectory = Trajectory(since(found.trajectory, t0_ns), found.trajectory.T)
+    return poses_at(trajectory, seconds(stamps_ns, t0_ns)), (), found.notes
 
 
 def _find_depth(mav0: Path, cam0: CameraLog, T_world_cam: Float[np.ndarray, "n 4 4"]) -> _Depth:

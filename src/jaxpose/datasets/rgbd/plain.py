@@ -55,7 +55,8 @@ def load(path: Path | str, *, rate_hz: float = 30.0, depth_per_metre: float | No
     Captures of Open3D and of its recorders for RealSense and Azure Kinect, and Redwood's, are such folders.
     Images are paired by equal names or numbers, or in order if none are equal and there are as many of both.
     Intrinsics are those of `camera-intrinsics.txt` (3x3), `intrinsics.json` (fx fy cx cy, and optional width
-    height depth_scale), or Open3D's `camera_intrinsic.json` or `intrinsic.json`, in the folder or one up.
+    height depth_scale distortion), or Open3D's `camera_intrinsic.json` or `intrinsic.json`, in the folder or
+    one up.
     Depth is registered to colour, 16 bits; where it is smaller, colour is resized to it.
 
     `times.txt` has a timestamp [s] for each colour image. `poses.txt` has a camera-to-world pose for each
@@ -80,7 +81,7 @@ def load(path: Path | str, *, rate_hz: float = 30.0, depth_per_metre: float | No
     folder = Path(path)
     all_colors, all_depths = _images(folder, _COLORS), _images(folder, ("depth",))
     rows, partners, paired = _pairs(folder, all_colors, all_depths)
-    pinhole, stated_per_metre = read_camera(folder, image_size(all_colors[rows[0]]))
+    camera, stated_per_metre = read_camera(folder, image_size(all_colors[rows[0]]))
     assumed = () if depth_per_metre or stated_per_metre else ("no depth_scale: took depth as mm",)
     count = len(all_colors)
     ns = _read_times(folder / "times.txt", count)
@@ -95,7 +96,7 @@ def load(path: Path | str, *, rate_hz: float = 30.0, depth_per_metre: float | No
         path,
         [all_colors[i] for i in rows],
         [all_depths[i] for i in partners],
-        lambda size, depth_size: (pinhole, ()),
+        lambda size, depth_size: (camera, ()),
         t=[ns[row] for row in rows],
         names=[all_colors[row].stem for row in rows],
         poses=Poses(

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxpose.datasets.images import INTRINSICS, Pinhole, check_intrinsics, read_intrinsics, sidecar
+from jaxpose.datasets.images import INTRINSICS, check_intrinsics, read_intrinsics, sidecar
 from jaxpose.errors import DataError
 from jaxpose.files.association import nearest
 from jaxpose.files.schema import numbers
@@ -14,27 +14,31 @@ from jaxpose.files.tables import numbered_lines, read_numbers, seconds
 from jaxpose.files.timestamps import whole_ns
 from jaxpose.files.trajectories import read_kitti, read_trajectory
 from jaxpose.files.untrusted import read_json
+from jaxpose.geometry.camera import Camera
 
 JSON = ("intrinsics.json", "camera_intrinsic.json", "intrinsic.json")
 LOGS = ("trajectory.log", "scene/trajectory.log")
 _MOST_APART_S = 0.02  # between a frame's timestamp and that of its pose
+_MOST = 1e9  # of coefficients of distortion
 _POSE_COLUMNS = "16 (4x4), 12 (KITTI) or 8 (TUM) numbers"
 
 
-def read_camera(folder: Path, size: tuple[int, int]) -> tuple[Pinhole, float | None]:
-    """Intrinsics for images of a size, and counts of depth a metre where a file says them.
+def read_camera(folder: Path, size: tuple[int, int]) -> tuple[Camera, float | None]:
+    """The camera of images of a size, and counts of depth a metre where a file says them.
 
     DataError where no file has them.
     """
     for name in (INTRINSICS, *JSON):
         if (file := sidecar(folder, name)) is not None:
-            return (read_intrinsics(file, size), None) if name == INTRINSICS else _read_json(file, size)
+            if name == INTRINSICS:
+                return Camera(*read_intrinsics(file, size), *size), None
+            return _read_json(file, size)
     names = ", ".join((INTRINSICS, *JSON))
     raise DataError(f"{folder}: expected one of {names} in it or one folder up, got none")
 
 
-def _read_json(file: Path, size: tuple[int, int]) -> tuple[Pinhole, float | None]:
-    """Our own `fx fy cx cy`, or Open3D's `intrinsic_matrix`, column by column."""
+def _read_json(file: Path, size: tuple[int, int]) -> tuple[Camera, float | None]:
+    """Our own `fx fy cx cy`, with OpenCV's `distortion`, or Open3D's `intrinsic_matrix`, column by column."""
     content = read_json(file, "intrinsics")
     number = lambda key: float(numbers(file, content, key))
     if "intrinsic_matrix" in content:
@@ -52,7 +56,12 @@ def _read_json(file: Path, size: tuple[int, int]) -> tuple[Pinhole, float | None
     per_metre = float(numbers(file, content, "depth_scale", above=0)) if "depth_scale" in content else None
     if per_metre is not None and per_metre <= 1:
         raise DataError(f"{file}: depth_scale: expected counts a metre, got {per_metre:g}: metres a count?")
-    return check_intrinsics(file, K, size), per_metre
+    lens = ()
+    if "distortion" in content:
+        lens = tuple(numbers(file, content, "distortion", (None,), least=-_MOST, most=_MOST).tolist())
+        if len(lens) not in (0, 4, 5):
+            raise DataError(f"{file}: distortion: expected k1 k2 p1 p2 [k3], got {len(lens)} numbers")
+    return Camera(*check_intrinsics(file, K, size), *size, lens if any(lens) else ()), per_metre
 
 
 def read_poses(file: Path, ns: list[int] | None, count: int) -> tuple[list[int] | None, Any]:

@@ -111,6 +111,15 @@ class Bag:
         except Exception as error:
             raise self._damaged(error) from None
 
+    def raw(self, topic: str) -> Iterator[tuple[int, bytes, bool]]:
+        """Time of recording [ns] and bytes of all messages of a topic, and whether they are CDR of ROS 2."""
+        connections = [c for c in self._reader.connections if c.topic == topic]
+        try:
+            for _, ns, raw in self._reader.messages(connections):
+                yield ns, raw, self._reader.is2
+        except Exception as error:
+            raise self._damaged(error) from None
+
     def first(self, topic: str) -> Any:
         """The first message of a topic."""
         for _, _, message in self.messages(topic):

@@ -27,7 +27,7 @@ class View(NamedTuple):
     notes: tuple[str, ...]
 
 
-class _Lens(NamedTuple):
+class TopicLens(NamedTuple):
     """The camera of a topic, and the lens that has to be undone in its images for it."""
 
     camera: Camera
@@ -54,7 +54,7 @@ def common_view(bag: Bag, tree: Tree, color: ImageTopic, depth: ImageTopic) -> V
     info = camera_topic(bag, color) or (camera_topic(bag, depth) if depth.frame == color.frame else None)
     if info is None:
         raise DataError(f"{bag.path}: expected a CameraInfo of {color.topic.name}, got none")
-    lens = _lens(bag, info, color)
+    lens = lens_of(bag, info, color)
     (width, height), (w, h) = color.kind.size, depth.kind.size
     if depth.frame != color.frame or abs(width / height / (w / h) - 1) > _SAME_SHAPE:
         return _registered(bag, tree, color, depth, lens)
@@ -72,7 +72,7 @@ def common_view(bag: Bag, tree: Tree, color: ImageTopic, depth: ImageTopic) -> V
     return View(camera, lambda rgb, z: Frame(_resized(rgb, camera), z), (*lens.notes, note))
 
 
-def _registered(bag: Bag, tree: Tree, color: ImageTopic, depth: ImageTopic, lens: _Lens) -> View:
+def _registered(bag: Bag, tree: Tree, color: ImageTopic, depth: ImageTopic, lens: TopicLens) -> View:
     """Depth of a camera of its own, registered to colour."""
     (width, height), (w, h) = color.kind.size, depth.kind.size
     other, T_color_depth = camera_topic(bag, depth), tree.static(color.frame, depth.frame)
@@ -82,7 +82,7 @@ def _registered(bag: Bag, tree: Tree, color: ImageTopic, depth: ImageTopic, lens
         raise DataError(
             f"{bag.path}: expected depth registered to colour, or what registers it, got {got}, no {lacking}"
         )
-    of_depth = _lens(bag, other, depth)
+    of_depth = lens_of(bag, other, depth)
     rays = pixel_rays(of_depth.camera, of_depth.coefficients) if len(of_depth.coefficients) else None
     camera = lens.camera
     if width > 1.5 * w:  # else most pixels of colour would stay without depth
@@ -95,7 +95,7 @@ def _registered(bag: Bag, tree: Tree, color: ImageTopic, depth: ImageTopic, lens
     return View(camera, lambda rgb, z: Frame(color_of(rgb), register(z)), (*lens.notes, note))
 
 
-def _lens(bag: Bag, topic: str, image: ImageTopic) -> _Lens:
+def lens_of(bag: Bag, topic: str, image: ImageTopic) -> TopicLens:
     """The camera of a CameraInfo, of the size of its images."""
     info, (width, height) = bag.first(topic), image.kind.size
     K, D, P = (np.array(_either(info, name), np.float64) for name in "KDP")
@@ -116,9 +116,9 @@ def _lens(bag: Bag, topic: str, image: ImageTopic) -> _Lens:
         (f"{topic} is of {size[0]}x{size[1]}, scaled to {width}x{height}",) if size != (width, height) else ()
     )
     if not D[5:].any():
-        return _Lens(camera, np.zeros(0), note)
+        return TopicLens(camera, np.zeros(0), note)
     undone = f"{topic}: the lens of {model} is undone in the images, which are a pinhole's"
-    return _Lens(camera._replace(distortion=()), D, (*note, undone))
+    return TopicLens(camera._replace(distortion=()), D, (*note, undone))
 
 
 def _either(message: Any, name: str) -> Any:

@@ -10,7 +10,7 @@ from jaxpose.datasets.rgbd.ros_images import ImageKind, image_kind
 from jaxpose.errors import DataError
 
 _IMAGES = ("Image", "CompressedImage")
-_POSES = ("PoseStamped", "PoseWithCovarianceStamped", "TransformStamped", "Odometry")
+POSES = ("PoseStamped", "PoseWithCovarianceStamped", "TransformStamped", "Odometry")
 _REGISTERED = ("aligned", "registered")
 
 
@@ -79,11 +79,11 @@ def choose(bag: Bag, wanted: Sequence[str] = ()) -> Chosen:
     )
     kinds = lambda *kinds: [topic for topic in bag.topics.values() if topic.kind in kinds]
     others = [str(image) for image in images if image not in (color, depth)]
-    others += [f"{topic.name} ({topic.kind}, {topic.count})" for topic in kinds("Imu", *_POSES)]
+    others += [f"{topic.name} ({topic.kind}, {topic.count})" for topic in kinds("Imu", *POSES)]
     note = f"used {color} with {depth}"
     note += f"; --topics chooses among {', '.join(others)}" if others else ""
     named = lambda topics: [topic for topic in topics if topic.name in wanted] or topics
-    return Chosen(color, depth, named(kinds("Imu")), named(kinds(*_POSES)), (note,))
+    return Chosen(color, depth, named(kinds("Imu")), named(kinds(*POSES)), (note,))
 
 
 def camera_topic(bag: Bag, image: ImageTopic) -> str | None:
