@@ -1,15 +1,13 @@
 """`jaxpose check` on RGB-D recordings: faults put into one that is right, each named."""
 
-from typing import NamedTuple, get_args
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 from helpers.checks import FLIP, T0, T0_NS, checked, faults, flipped, inverted, named_tests
-from helpers.refused import complaint
 from scipy.spatial.transform import Rotation
 
-from jaxpose.cli.check.command import exit_code, main, report
-from jaxpose.datasets.rgbd import registry
+from jaxpose.cli.check.command import exit_code, report
 
 
 class Clip(NamedTuple):
@@ -163,13 +161,3 @@ def test_a_camera_at_rest_tells_nothing(tmp_path, clip, save):
     still = clip._replace(depth=clip.depth[[0] * 21], T_world_cam=clip.T_world_cam[[0] * 21])
     result = checked(plain(tmp_path, still, save))
     assert faults(result) == "" and any("moves too little" in note for note in result.notes)
-
-
-def test_the_formats_that_are_read_are_a_table(capsys):
-    main(["--formats"])
-    rows = [line.strip("| ").split(" | ") for line in capsys.readouterr().out.strip().splitlines()]
-    rows = [row for row in rows if len(row) == 4]  # no others: the line between head and body has no blanks
-    assert [row[1].strip() for row in rows[1:]] == list(get_args(registry.Format))
-    tum = next(row for row in rows if row[1].strip() == "tum")
-    assert "`rgb.txt`, `depth.txt`" in tum[2]
-    assert "expected DATA to check, or --formats" in complaint(main)

@@ -14,6 +14,7 @@ from jaxpose.experiments.slam.source import load
 
 LAYOUTS = {
     "ros": ["walk.bag"],
+    "azure_kinect": ["walk.mkv"],
     "record3d": ["metadata", "rgbd/0.jpg", "rgbd/0.depth"],
     "stray_scanner": ["rgb.mp4", "odometry.csv", "camera_matrix.csv", "depth/000000.png"],
     "arkitscenes": ["lowres_wide/1_2.5.png", "lowres_depth/1_2.5.png", "lowres_wide.traj"],
@@ -31,7 +32,11 @@ LAYOUTS = {
 
 
 # Of files that are known by their content.
-MAGIC = {"walk.bag": b"#ROSBAG V2.0\n", "transforms.json": b'{"frames": [{"depth_file_path": "1"}]}'}
+MAGIC = {
+    "walk.bag": b"#ROSBAG V2.0\n",
+    "walk.mkv": b"\x1aE\xdf\xa3 k4arecord",
+    "transforms.json": b'{"frames": [{"depth_file_path": "1"}]}',
+}
 
 
 def touch(folder, files):

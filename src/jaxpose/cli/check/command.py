@@ -11,7 +11,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import tyro
 
@@ -20,6 +20,9 @@ from jaxpose.errors import DataError
 from jaxpose.experiments.command import Command, execute
 from jaxpose.experiments.outcome import markdown_table
 from jaxpose.experiments.progress import OnUpdate, Update, silent
+
+if TYPE_CHECKING:
+    from jaxpose.cli.formats import Row
 
 _KNOWN = (
     "an RGB-D recording (7-Scenes, TUM, ICL-NUIM, Replica, ScanNet, EuRoC, or color/ and depth/ with "
@@ -35,7 +38,7 @@ class Config:
     # folder, bag, or trajectory file; nothing with --formats
     data: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")] = None
     topics: tuple[str, ...] = ()  # of a ROS bag, those to use before others of their kind
-    formats: bool = False  # print which recordings are read, as a table
+    formats: bool = False  # print what is read and written, and what each is tested with, as a table
     imu_file: Path | None = None  # readings to test by themselves and against the poses of DATA
     imu_extrinsics: Path | None = None  # of --imu-file: T_body_cam, as in `jaxpose slam`
     columns: str | None = None  # of a trajectory file that does not say: `t[us] tx ty tz qw qx qy qz`
@@ -47,9 +50,9 @@ class Config:
 
 
 class Formats(NamedTuple):
-    """The recordings that are read: what each is called, its name as an option, its files, and its tests."""
+    """What is read and written, and what each is tested with."""
 
-    rows: tuple[tuple[str, str, str, str], ...]
+    rows: tuple["Row", ...]
 
 
 class Result(NamedTuple):
@@ -76,7 +79,9 @@ def run(config: Config, on_update: OnUpdate = silent) -> Result | Formats:
         DataError, OSError: for what cannot be used.
     """
     if config.formats:
-        return _formats()
+        from jaxpose.cli.formats import all_formats  # here, as the loaders load jax
+
+        return Formats(all_formats())
     path = config.data
     if path is None:
         raise DataError("expected DATA to check, or --formats for what is read, got neither")
@@ -123,7 +128,10 @@ def main(args: Sequence[str] | None = None, prog: str = "jaxpose check") -> None
 def report(result: Result | Formats) -> str:
     """What was found, a line each, warnings and errors last."""
     if isinstance(result, Formats):
-        return markdown_table([("recordings of", "format", "files", "tested with"), *result.rows])
+        head = ("data", "format", "`--format`, files", "read: tested with", "written by", "tested with")
+        name = lambda row: f"{row.name}: {row.files}" if row.name else row.files
+        rows = [(r.kind, r.title, name(r), r.read_by, r.written, r.written_by) for r in result.rows]
+        return markdown_table([head, *rows])
     width = max(10, *(len(name) for name, *_ in result.facts), *(len(f.test) for f in result.findings)) + 9
     lines = [("format", f"{result.path}  {result.format}")]
     lines += [(fact.name, fact.text) for fact in result.facts]
@@ -148,17 +156,6 @@ def _verdict(result: Result) -> str:
         return "unusable as it is"
     plural = "s" if counts["warning"] > 1 else ""
     return f"{counts['warning']} warning{plural}" if counts["warning"] else "no fault found"
-
-
-def _formats() -> Formats:
-    """What the registry of recordings says of itself."""
-    from jaxpose.datasets.rgbd import registry as rgbd_registry
-
-    rows = []
-    for name, layout in rgbd_registry.LAYOUTS.items():
-        files = ", ".join(f"`{rgbd_registry.words(part)}`" for part in layout.files)
-        rows.append((layout.title, name, files, layout.tested))
-    return Formats(tuple(rows))
 
 
 def _is_recording(path: Path) -> bool:

@@ -35,9 +35,11 @@ class _Module(Protocol):
     ) -> EventRecording: ...
 
 
-class _Layout(NamedTuple):
-    """What a layout looks like in words and in a file's suffix, its module, and the colour of its pixels."""
+class Layout(NamedTuple):
+    """A layout: what it is called, what files it has, its module, and the colour of its pixels."""
 
+    title: str
+    tested: str  # what its test reads
     files: str
     suffixes: tuple[str, ...]
     module: _Module
@@ -45,13 +47,36 @@ class _Layout(NamedTuple):
 
 
 # In the order in which they are tried: EventNeRF's events are an npz, too.
-_LAYOUTS: dict[Format, _Layout] = {
-    "eventnerf": _Layout("intrinsics/, pose/ and events/*.npz", (), eventnerf, "rggb"),
-    "davis": _Layout("events.txt", (".txt",), davis, "mono"),
-    "hdf5": _Layout("an HDF5 file", (".h5", ".hdf5"), event_hdf5, "mono"),
-    "npz": _Layout("an npz file with x y t p", (".npz",), event_npz, "mono"),
-    "file": _Layout("a RAW, DAT, AEDAT 4, ES or csv file", single_file.SUFFIXES, single_file, "mono"),
-    "ros": _Layout("a ROS bag with events", (), ros, "mono"),
+LAYOUTS: dict[Format, Layout] = {
+    "eventnerf": Layout(
+        "EventNeRF", "a made folder", "intrinsics/, pose/ and events/*.npz", (), eventnerf, "rggb"
+    ),
+    "davis": Layout("DAVIS text", "made folders, slider_depth", "events.txt", (".txt",), davis, "mono"),
+    "hdf5": Layout(
+        "HDF5: DSEC, Prophesee's, at the root (extra `hdf5`)",
+        "h5py",
+        "an HDF5 file",
+        (".h5", ".hdf5"),
+        event_hdf5,
+        "mono",
+    ),
+    "npz": Layout("npz", "numpy", "an npz file with x y t p", (".npz",), event_npz, "mono"),
+    "file": Layout(
+        "Prophesee RAW (EVT 2, 2.1, 3), DAT, AEDAT 4 (extra `events`), Event Stream, csv",
+        "made bytes by the vendors' documents, dv-processing",
+        "a RAW, DAT, AEDAT 4, ES or csv file",
+        single_file.SUFFIXES,
+        single_file,
+        "mono",
+    ),
+    "ros": Layout(
+        "ROS 1 and ROS 2 bags (extra `ros`)",
+        "bags that rosbags writes",
+        "a ROS bag with events",
+        (),
+        ros,
+        "mono",
+    ),
 }
 
 
@@ -69,12 +94,12 @@ def find_format(path: Path | str) -> Format:
     """
     path = Path(path)
     for name in get_args(Format):
-        layout = _LAYOUTS[name]
+        layout = LAYOUTS[name]
         if (path.is_dir() or name == "ros") and layout.module.detect(path):
             return name
         if path.is_file() and path.suffix.lower() in layout.suffixes:
             return name
-    expected = ", or ".join(f"{layout.files} ({name})" for name, layout in _LAYOUTS.items())
+    expected = ", or ".join(f"{layout.files} ({name})" for name, layout in LAYOUTS.items())
     raise DataError(f"{path}: expected a recording of events, {expected}, got {found(path)}")
 
 
@@ -92,7 +117,7 @@ def find(path: Path | str, format: Format | None = None, *, size: tuple[int, int
     Raises:
         DataError: Naming the file for anything that cannot be used.
     """
-    return _LAYOUTS[format or find_format(path)].module.find(path, size=size)
+    return LAYOUTS[format or find_format(path)].module.find(path, size=size)
 
 
 def load_events(
@@ -121,5 +146,5 @@ def load_events(
         DataError: Naming the file, and line or event, for anything that cannot be used (`validate.clean`).
         ValueError: For another mosaic, and for a span that does not rise.
     """
-    layout = _LAYOUTS[format or find_format(path)]
+    layout = LAYOUTS[format or find_format(path)]
     return layout.module.load(path, mosaic=mosaic or layout.mosaic, size=size, unit=unit, span=span)

@@ -1,7 +1,8 @@
 """Any folder of photographs: which of the layouts it has, by its files, and its loader."""
 
 from pathlib import Path
-from typing import Literal, get_args
+from types import ModuleType
+from typing import Literal, NamedTuple, get_args
 
 from jaxpose.datasets.images import found
 from jaxpose.datasets.photos import blender, colmap, llff, plain
@@ -10,12 +11,27 @@ from jaxpose.errors import DataError
 
 Format = Literal["llff", "transforms", "colmap", "plain"]
 
+
+class Layout(NamedTuple):
+    """A layout: what it is called, what files it has, and its loader."""
+
+    title: str
+    files: str
+    module: ModuleType
+    tested: str  # what its test reads
+
+
 # In the order in which they are tried: what states poses goes before a model that it was made from.
-_LAYOUTS = {
-    "llff": (llff, "poses_bounds.npy (LLFF)"),
-    "transforms": (blender, "transforms_train.json or transforms.json (Blender, nerfstudio, instant-ngp)"),
-    "colmap": (colmap, "a sparse model (COLMAP)"),
-    "plain": (plain, "images alone"),
+LAYOUTS: dict[Format, Layout] = {
+    "llff": Layout("LLFF", "poses_bounds.npy", llff, "a made folder, fern"),
+    "transforms": Layout(
+        "Blender, nerfstudio, instant-ngp",
+        "transforms_train.json or transforms.json",
+        blender,
+        "made folders, lego",
+    ),
+    "colmap": Layout("COLMAP", "a sparse model", colmap, "pycolmap"),
+    "plain": Layout("photographs without poses", "images alone", plain, "made folders with EXIF by Pillow"),
 }
 
 
@@ -33,9 +49,9 @@ def find_format(path: Path | str) -> Format:
     """
     path = Path(path)
     for name in get_args(Format):
-        if _LAYOUTS[name][0].detect(path):
+        if LAYOUTS[name].module.detect(path):
             return name
-    expected = ", ".join(words for _, words in _LAYOUTS.values())
+    expected = ", ".join(f"{layout.files} ({layout.title})" for layout in LAYOUTS.values())
     raise DataError(f"{path}: expected photographs, with {expected}, got {found(path)}")
 
 
@@ -65,8 +81,9 @@ def load_photographs(
     if format == "plain":
         return plain.load(path, width=width, focal_px=focal_px)
     if focal_px is not None:
-        raise DataError(f"{path}: expected no focal length with {_LAYOUTS[format][1]}, which states cameras")
-    return _LAYOUTS[format][0].load(path, width=width)
+        files = LAYOUTS[format].files
+        raise DataError(f"{path}: expected no focal length with {files}, which states cameras")
+    return LAYOUTS[format].module.load(path, width=width)
 
 
 def images_folder(path: Path | str, format: Format | None = None) -> Path:
