@@ -2,42 +2,14 @@
 
 import numpy as np
 import pytest
+from helpers.shared_points import FOCAL, around, disturbed, seen
 from numpy.testing import assert_allclose
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from jaxpose.evaluation.trajectory_error import align, pose_errors, procrustes
 from jaxpose.geometry import rigid
-from jaxpose.structure import Tracks, adjust
-
-FOCAL = 200.0
-
-
-def around(count: int, radius: float = 4.0, degrees: float = 360.0) -> np.ndarray:
-    """Cameras on a wavy part of a circle that look at the origin."""
-    angle = np.linspace(0, np.radians(degrees), count, endpoint=False)
-    height = 0.6 * np.sin(2 * angle)
-    centre = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=1)
-    forward = -centre / np.linalg.norm(centre, axis=1, keepdims=True)
-    right = np.cross(forward, [0, 0, 1.0])
-    right /= np.linalg.norm(right, axis=1, keepdims=True)
-    return rigid.make(np.stack([right, np.cross(forward, right), forward], axis=-1), centre)
-
-
-def seen(T: np.ndarray, points: np.ndarray, random, noise_px: float = 0.0, wrong: float = 0.0, share=0.6):
-    """Tracks of points, each in a share of the cameras; some of the matches lead anywhere."""
-    view, point = np.nonzero(random.random((len(T), len(points))) < share)
-    at = np.einsum("oji,oj->oi", T[view, :3, :3], points[point] - T[view, :3, 3])
-    xy = at[:, :2] / at[:, 2:] + random.normal(0, noise_px / FOCAL, (len(view), 2))
-    lost = random.random(len(view)) < wrong
-    xy[lost] = random.uniform(-0.3, 0.3, (lost.sum(), 2))
-    return Tracks(view, point, xy, len(T), FOCAL)
-
-
-def disturbed(T: np.ndarray, random, metres: float, radians: float) -> np.ndarray:
-    return T @ rigid.exp(
-        np.concatenate([random.normal(0, metres, (len(T), 3)), random.normal(0, radians, (len(T), 3))], 1)
-    )
+from jaxpose.structure import adjust
 
 
 def test_poses_far_off_are_found_among_wrong_matches():
@@ -91,6 +63,15 @@ def test_all_cameras_may_start_in_one_place():
     assert_allclose(np.median(found.depth), 5.0)
     moved = align(procrustes(found.T_world_cam, T), found.T_world_cam)
     assert_allclose(moved[:, :3, 3], T[:, :3, 3], atol=0.02)
+
+
+@pytest.mark.parametrize("given", ["of other photographs", "in one place"])
+def test_given_poses_that_are_wrong_do_no_harm(given):
+    random = np.random.default_rng(4)
+    T, points = around(16), random.uniform(-1, 1, (90, 3))
+    start = T[random.permutation(16)] if given == "of other photographs" else np.tile(T[0], (16, 1, 1))
+    found = adjust(seen(T, points, random, noise_px=0.2, wrong=0.1), start, depth=4.0)
+    assert found.supported.all() and pose_errors(found.T_world_cam, T).rotation_deg < 0.2
 
 
 def test_photographs_that_share_nothing_keep_their_poses():

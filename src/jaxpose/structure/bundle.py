@@ -3,6 +3,7 @@
 Reprojection errors in the robust loss of Geman and McClure (1985), minimised by Levenberg-Marquardt with the
 points eliminated (Schur complement; Triggs et al. 1999). The loss starts as wide as the errors and narrows to
 their noise (graduated non-convexity, Blake and Zisserman 1987), so that wrong matches count less and less.
+Two descents, from the given poses and from those that the photographs alone tell: that of less loss counts.
 """
 
 from collections.abc import Callable
@@ -17,10 +18,13 @@ from jaxpose._checks import check_finite, check_shapes
 from jaxpose.evaluation.trajectory_error import align, procrustes
 from jaxpose.geometry import rigid
 from jaxpose.geometry.rigid import Similarity
+from jaxpose.structure.global_poses import global_poses
+from jaxpose.structure.relative import sums
 from jaxpose.structure.tracks import Tracks
 
 _OUTLIER = 3.0  # sigmas of reprojection
 _FEWEST = 12  # observations that agree, of a photograph whose pose is believed
+_FEWEST_TIED = 4  # photographs
 _NARROWER = 3.0  # times the loss, from stage to stage
 _LEAST_NOISE = 0.05  # [px]
 _WIDE = 90  # [%] of the errors at the start, that the loss begins with
@@ -95,15 +99,12 @@ def adjust(
     problem = _problem(tracks, _NEAREST * depth)
     if problem is None:
         return None
-    found = _solution(problem, np.array(T_start, np.float64), depth, on_step)
-    if not _apart(T_start, depth):
-        # Seen from one place a scene may be turned inside out, cameras on the wrong side of one another.
-        other = _solution(problem, _mirrored(found.T, depth), depth, on_step)
-        found = min(found, other, key=lambda each: np.median(each.errors.size))
-    T, points, errors, sigma = found
+    found = [_solution(problem, T, depth, on_step) for T in _starts(problem, T_start, depth)]
+    width = _OUTLIER * min(each.sigma for each in found)
+    T, points, errors, sigma = min(found, key=lambda each: _loss(each.errors, width))
     agree = errors.size < _OUTLIER * sigma
     supported = np.asarray(problem.by_view @ agree.astype(np.float64)) >= _FEWEST
-    if supported.sum() < max(4, len(T) / 2):
+    if supported.sum() < max(_FEWEST_TIED, len(T) / 2):
         return None
     to_start = _gauge(T[supported], T_start[supported], errors.point_cam[agree, 2], depth)
     moved = np.where(supported[:, None, None], align(to_start, T), T_start)
@@ -140,20 +141,6 @@ def _apart(T: Float[np.ndarray, "n 4 4"], depth: float) -> bool:
     return float(np.linalg.norm(centre - centre.mean(axis=0), axis=1).mean()) > _WIDEST * depth
 
 
-def _mirrored(T: Float[np.ndarray, "n 4 4"], depth: float) -> Float[np.ndarray, "n 4 4"]:
-    """Cameras on the other side of their middle, which see that of the scene where they saw it."""
-    centre, axis = T[:, :3, 3], T[:, :3, 2].mean(axis=0)
-    middle = centre.mean(axis=0)
-    aim = middle + depth * axis / np.linalg.norm(axis)
-    mirrored = 2 * middle - centre
-    before, after = ((aim - c) / np.linalg.norm(aim - c, axis=1, keepdims=True) for c in (centre, mirrored))
-    across = np.cross(before, after)
-    sine = np.linalg.norm(across, axis=1, keepdims=True)
-    angle = np.arctan2(sine, np.sum(before * after, axis=1, keepdims=True))
-    turn = rigid.so3_exp(across / np.maximum(sine, 1e-12) * angle)
-    return rigid.make(turn @ T[:, :3, :3], mirrored)
-
-
 def _problem(tracks: Tracks, nearest: float) -> _Problem | None:
     """The observations of the most photographs that hang together; None where there are none."""
     n, m = tracks.views, tracks.points
@@ -166,10 +153,22 @@ def _problem(tracks: Tracks, nearest: float) -> _Problem | None:
     view, (_, point) = tracks.view[kept], np.unique(tracks.point[kept], return_inverse=True)
     if len(view) == 0:
         return None
-    rows = np.arange(len(view))
-    by_view = sp.csr_matrix((np.ones(len(view)), (view, rows)), (n, len(view)))
-    by_point = sp.csr_matrix((np.ones(len(view)), (point, rows)), (point.max() + 1, len(view)))
+    by_view, by_point = sums(view, n), sums(point, int(point.max()) + 1)
     return _Problem(view, point, tracks.xy_cam[kept], tracks.focal, nearest, by_view, by_point)
+
+
+def _starts(
+    problem: _Problem, T_start: Float[np.ndarray, "n 4 4"], depth: float
+) -> list[Float[np.ndarray, "n 4 4"]]:
+    """The given poses, unless they are all in one place, and those that the photographs alone tell."""
+    given = np.array(T_start, np.float64)
+    tracks = Tracks(problem.view, problem.point, problem.xy, len(given), problem.focal)
+    T, tied = global_poses(tracks)
+    if tied.sum() < _FEWEST_TIED:
+        return [given]
+    in_world = align(_gauge(T[tied], given[tied], np.ones(1), depth), T)
+    told = np.where(tied[:, None, None], in_world, given)
+    return [told, given] if _apart(given, depth) else [told]
 
 
 def _start_points(problem: _Problem, T: Float[np.ndarray, "n 4 4"], depth: float) -> Float[np.ndarray, "m 3"]:

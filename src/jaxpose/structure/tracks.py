@@ -20,7 +20,7 @@ _MOST = 1000  # features of a photograph
 _CONTRAST, _EDGE = 0.006, 10.0  # of SIFT: fainter blobs count than in its paper, RANSAC sorts them out
 _SMALL_PX = 200  # images below it are enlarged twice: their finest blobs are too fine for SIFT's first octave
 _RATIO = 0.85  # of the distance to the best match against that to the second best
-_OUTLIER_PX = 0.7  # from the epipolar line
+OUTLIER_PX = 0.7  # from the epipolar line
 _AGREE = 0.5  # share of two photographs' matches that has to
 _ALL_PAIRS = 40  # photographs, up to which each is matched with each
 _NEIGHBOURS, _ALIKE = 6, 10  # else: photographs before and after, and most alike, that each is matched with
@@ -150,7 +150,7 @@ def _verified(
         return none
     cv2.setRNGSeed(0)
     _, chosen = cv2.findEssentialMat(
-        a, b, np.eye(3), method=cv2.RANSAC, prob=0.9999, threshold=_OUTLIER_PX / focal, maxIters=1000
+        a, b, np.eye(3), method=cv2.RANSAC, prob=0.9999, threshold=OUTLIER_PX / focal, maxIters=1000
     )
     kept = none if chosen is None else np.flatnonzero(chosen)
     return kept if len(kept) >= max(FEWEST, _AGREE * len(a)) else none

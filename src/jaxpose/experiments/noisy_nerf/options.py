@@ -180,7 +180,7 @@ def load(config: Config) -> Problem:
     extent = DIAMETER if config.data == ORBIT else float(pdist(train.T_world_cam[:, :3, 3]).max())
     origin = far_origin(train.T_world_cam, _FAR * extent)
     train, held_out = (p._replace(T_world_cam=moved(p.T_world_cam, -origin)) for p in (train, held_out))
-    T_start, words = _disturbed(config, train, extent)
+    T_start, words = disturbed(config, train, extent)
     strange = sorted({seen.kind for seen in train.lenses if stated(seen) is None})
     unwritten = [
         f"transforms.json has no lens {kind}: trajectory.txt alone holds the poses" for kind in strange
@@ -224,7 +224,7 @@ def middle(photographs: Photographs) -> float:
     return 2 / (1 / near + 1 / far) if photographs.spacing == "disparity" else (near + far) / 2
 
 
-def _disturbed(config: Config, train: Photographs, extent: float) -> tuple[Float[np.ndarray, "n 4 4"], str]:
+def disturbed(config: Config, train: Photographs, extent: float) -> tuple[Float[np.ndarray, "n 4 4"], str]:
     """The poses to start from, and what was done to them."""
     ground_truth = train.T_world_cam
     if config.noise == "none":
