@@ -47,7 +47,7 @@ class Bundle(NamedTuple):
 class _Problem(NamedTuple):
     """Observations, and who sees what as sparse matrices."""
 
-    view: Int[np.ndarray, " o"]
+    view: Int[np.ndarray, " o"]  # in order
     point: Int[np.ndarray, " o"]
     xy: Float[np.ndarray, "o 2"]
     focal: float
@@ -150,6 +150,7 @@ def _problem(tracks: Tracks, nearest: float) -> _Problem | None:
     seen = sp.coo_matrix((one, (tracks.view, n + tracks.point)), (n + m, n + m))
     _, group = connected_components(seen, directed=False)
     kept = group[tracks.view] == np.bincount(group[:n]).argmax()
+    kept = np.flatnonzero(kept)[np.argsort(tracks.view[kept], kind="stable")]
     view, (_, point) = tracks.view[kept], np.unique(tracks.point[kept], return_inverse=True)
     if len(view) == 0:
         return None
@@ -275,9 +276,8 @@ def _solve(
     n, m = len(system.view), len(system.point)
     of_view, of_point = (_damped(blocks, damping) for blocks in (system.view, system.point))
     inverse = np.linalg.inv(of_point)
-    rows = np.broadcast_to(6 * problem.view[:, None, None] + np.arange(6)[:, None], system.both.shape)
-    columns = np.broadcast_to(3 * problem.point[:, None, None] + np.arange(3), system.both.shape)
-    sparse = lambda blocks: sp.csr_matrix((blocks.ravel(), (rows.ravel(), columns.ravel())), (6 * n, 3 * m))
+    starts = problem.by_view.indptr  # of each view, in observations
+    sparse = lambda blocks: sp.bsr_matrix((blocks, problem.point, starts), (6 * n, 3 * m))
     both, eliminated = sparse(system.both), sparse(system.both @ inverse[problem.point])
     reduced = -(eliminated @ both.T).toarray()
     place = np.arange(n)
