@@ -11,11 +11,13 @@ from helpers.box import box_pixels, inside_of_a_box
 from jaxpose.datasets.synthetic import RoomConfig, room
 from jaxpose.datasets.types import Frame, Recording, select
 from jaxpose.evaluation import trajectory_error
-from jaxpose.geometry import se3
+from jaxpose.geometry import rigid, se3
 from jaxpose.geometry.camera import Camera
-from jaxpose.slam import RecoveryConfig, SlamConfig, run
+from jaxpose.slam import RecoveryConfig, SlamConfig, init, run, tracker
 from jaxpose.slam.keyframes import thumbnail
+from jaxpose.slam.observation import to_device
 from jaxpose.slam.tracker import _is_appearance_outlier, _looks_better, _usual
+from jaxpose.slam.tracking.features import FeaturePose, Features
 from jaxpose.slam.tracking.register import Tracked
 from jaxpose.slam.tracking.relocalise import CENTRES, relocalise
 from jaxpose.slam.types import Frames, TrackingStatus, no_frames
@@ -108,6 +110,36 @@ def test_colours_of_another_place_are_doubted_until_they_must_be_another_light()
     assert not is_outlier(frames, 13, 0.2) and is_outlier(frames, 13, 0.26)
     clean = no_frames(np.arange(20) / 4).put(np.arange(1, 5), colour_error=0.001)
     assert not is_outlier(clean, 5, 0.019) and is_outlier(clean, 5, 0.021)
+
+
+@pytest.mark.parametrize(("colour_there", "found_m"), [(0.01, 0.0), (0.05, 2.0)])
+def test_features_of_another_place_are_given_up_where_colours_speak_against_them(
+    monkeypatch, colour_there, found_m
+):
+    """Features say 2 m off, where surfaces fit and colours do not; with another light they fit nowhere."""
+    frames = no_frames(np.arange(7) / 10).put(
+        np.arange(6), T_world_body=np.eye(4), colour_error=0.01, loss=0.5
+    )
+    state = init(Camera(50.0, 50.0, 39.5, 29.5, 80, 60), T_world_cam=np.eye(4))._replace(frames=frames)
+    off = rigid.make(np.eye(3), np.array([2.0, 0, 0]))
+
+    def track(state, frames, predicted, *others):
+        T = predicted.T_ref_body[-1]
+        colour = 0.05 if np.linalg.norm(T[:3, 3]) > 1 else colour_there
+        few = {"valid": 0.9, "iterations": 5, "sigma": np.zeros(2), "exposure": np.ones(3)}
+        unknown = {"information": np.eye(6), "line_delay": np.zeros(2)}
+        return Tracked(T, None, 0.5, 0.01, colour_error=colour, **few, **unknown)
+
+    monkeypatch.setattr(tracker, "seen_pose", lambda *_: FeaturePose(off, 1e-5 * np.eye(6), 50))
+    monkeypatch.setattr(tracker, "_track", track)
+    rng = np.random.default_rng(0)
+    frame = Frame(rng.integers(0, 255, (60, 80, 3)).astype(np.uint8), np.ones((60, 80), np.float32))
+    by_motion = tracker.expected_motion(state)
+    nothing = Features(np.zeros((0, 3)), np.zeros(0), np.zeros(0), np.zeros((0, 32), np.uint8))
+    seen = frame, to_device(frame), nothing
+    found = tracker.next_pose(state, by_motion, *seen, rng, jax.random.key(0)).frames
+    assert np.linalg.norm(found.T_world_body[-1, :3, 3]) == pytest.approx(found_m, abs=1e-3)
+    assert found.status[-1] == TrackingStatus.TRACKED  # features that know where they are hold the frame
 
 
 def test_a_frame_looks_like_itself_in_another_light():

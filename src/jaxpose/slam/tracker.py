@@ -61,11 +61,13 @@ def next_pose(
     used = predicted
     tracked = _track(state, frames, predicted, image, generator, near_key)
     lost = _failed(state, tracked, reach, held)
-    if lost and seen is not None and not frames.doubted[-2]:  # features of another place, then
-        seen, held, predicted, used = None, False, by_motion, by_motion
-        reach = _reach(state, predicted, held)
-        tracked = _track(state, frames, predicted, image, generator, near_key)
-        lost = _failed(state, tracked, reach, held)
+    elsewhere = not is_blank(frame) and _is_appearance_outlier(policy, frames, float(tracked.colour_error))
+    if (lost or elsewhere) and seen is not None and not frames.doubted[-2]:  # features of another place?
+        other = _track(state, frames, by_motion, image, generator, near_key)
+        if lost or _looks_better(policy, other, tracked):
+            seen, held, predicted, used, tracked = None, False, by_motion, by_motion, other
+            reach = _reach(state, predicted, held)
+            lost = _failed(state, tracked, reach, held)
     if lost or (not held and _appearance_doubtful(state, tracked, predicted)):
         corrected, found = _relocalise(state, frame, image, predicted.T_ref_body[-1], reach, wide_key)
         sigma = np.minimum(predicted.sigma, FOUND_SIGMA)
@@ -81,9 +83,8 @@ def next_pose(
         return _update_state(state, state.frames, predicted, by_motion, tracked, TrackingStatus.LOST)
     if seen is not None:
         frames = frames.put(-1, feature_nis=feature_nis(state, frames, used, seen, tracked))
-    status = TrackingStatus.TRACKED
-    if (np.asarray(tracked.sigma) > policy.weak).any():
-        status = TrackingStatus.WEAK
+    weak = (np.asarray(tracked.sigma) > policy.weak).any()
+    status = TrackingStatus.WEAK if weak else TrackingStatus.TRACKED
     if (
         not held
         and not is_blank(frame)

@@ -20,6 +20,7 @@ from jaxpose.slam.loops.drift import drift_to_last, may_be_doubled, motion_sigma
 from jaxpose.slam.loops.rebuild import posed, rebuilt_map
 from jaxpose.slam.loops.verify import Verified, verify
 from jaxpose.slam.map.backend import seen_points
+from jaxpose.slam.tracking.feature_pose import FIRST_SCALE
 from jaxpose.slam.tracking.features import locate_camera
 from jaxpose.slam.types import Frames, SlamState
 
@@ -94,7 +95,7 @@ def _compared(state: SlamState, frame: Frame, read: FrameReader, places: list[in
 
 
 def is_same_place(verified: Verified, policy: LoopConfig) -> bool:
-    """Whether depth and colour of two images agree, and hold every direction of their relative pose.
+    """Whether depth, colour and features of two images agree, and hold all of their relative pose.
 
     Args:
         verified: the images' comparison.
@@ -103,7 +104,9 @@ def is_same_place(verified: Verified, policy: LoopConfig) -> bool:
     Returns:
         False for what is in any doubt.
     """
-    compared, covariance = verified.compared, np.linalg.inv(verified.information)
+    compared, features = verified.compared, verified.features
+    covariance = np.linalg.inv(verified.information)
+    apart = rigid.log(rigid.inverse(features.T_world_cam) @ verified.T_a_b)
     worst = max(np.linalg.eigvalsh(covariance[k : k + 3, k : k + 3])[-1] for k in (0, 3))
     return bool(
         compared.overlap > policy.overlap
@@ -111,6 +114,7 @@ def is_same_place(verified: Verified, policy: LoopConfig) -> bool:
         and compared.conflict < policy.conflict
         and compared.colour > policy.colour
         and np.sqrt(worst) < policy.sigma
+        and apart @ np.linalg.solve(FIRST_SCALE * features.covariance, apart) < CHI2_999
     )
 
 
@@ -184,7 +188,7 @@ def corrected(state: SlamState, frame: Frame | None, read: FrameReader) -> SlamS
     """The run with its poses, its map and what it goes on with as its loops have them.
 
     Args:
-        state: a run with loops.
+        state: a run with loops. Its map is no longer usable.
         frame: its last frame, where `read` does not know it yet.
         read: keyframes.
 

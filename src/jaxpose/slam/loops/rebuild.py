@@ -1,16 +1,18 @@
 """The map made anew from frames at the poses that they have by now."""
 
 from collections.abc import Iterable
+from functools import partial
 from itertools import islice
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from jaxpose.datasets.types import Frame
 from jaxpose.geometry import rigid
-from jaxpose.scenes.voxel_blocks import BlockConfig, Blocks, empty_blocks
+from jaxpose.scenes.voxel_blocks import BlockConfig, Blocks
 from jaxpose.slam.map.backend import allocation_points, map_backend
 from jaxpose.slam.map.integrate import grown_map
 from jaxpose.slam.map.photometric import MapState
@@ -30,23 +32,17 @@ class Posed(NamedTuple):
 
 
 def rebuilt_map(state: SlamState, frames: Iterable[Posed]) -> MapState:
-    """The map that integrating some frames makes, in a pool as large as the old one.
+    """The map that integrating some frames makes, written over the old one.
 
     Args:
-        state: a run that maps by integration.
+        state: a run that maps by integration. Its map is no longer usable.
         frames: what to integrate; a few of them are held at a time.
 
     Returns:
         The map; nothing is compiled for it, unless it needs more room than before.
     """
     assert isinstance(state.grid, BlockConfig) and state.map is not None
-    old: Blocks = state.map.params
-    room = {"capacity": old.values.shape[0], "side": old.table.shape[0]}
-    made, update, left = (
-        MapState(empty_blocks(state.grid, **room), ()),
-        map_backend(state).update,
-        iter(frames),
-    )
+    made, update, left = MapState(_emptied(state.map.params), ()), map_backend(state).update, iter(frames)
     while some := list(islice(left, _TOGETHER)):
         measured = [allocation_points(x.frame, state.camera, x.T_world_cam) for x in some]
         made = grown_map(state.grid, made, np.concatenate(measured))
@@ -54,6 +50,14 @@ def rebuilt_map(state: SlamState, frames: Iterable[Posed]) -> MapState:
             image = to_device(x.frame)._replace(exposure=jnp.asarray(x.exposure, jnp.float32))
             made = update(made, image, jnp.asarray(x.T_world_cam, jnp.float32))
     return made
+
+
+@partial(jax.jit, donate_argnums=0)
+def _emptied(blocks: Blocks) -> Blocks:
+    """The blocks with nothing in them, in the same memory; row 0 is empty space."""
+    nothing = jax.tree.map(jnp.zeros_like, blocks)
+    values = jnp.broadcast_to(blocks.values[:1], blocks.values.shape)
+    return nothing._replace(corner=blocks.corner, count=jnp.int32(1), values=values)
 
 
 def posed(state: SlamState, frame: Frame, i: int) -> Posed:

@@ -27,30 +27,25 @@ def refined(state: SlamState, read: FrameReader) -> SlamState:
     """The run after all its frames, with poses and a map that agree.
 
     Args:
-        state: a run that maps by integration.
-        read: all of its frames.
+        state: a run that maps by integration. Its map is no longer usable.
+        read: all of its frames, each once and those that are mapped twice.
 
     Returns:
         The state. Frames that were in doubt and are found are so no more.
     """
     frames, known = state.frames, np.flatnonzero(~state.frames.doubted)
-
-    def registered():
-        nonlocal frames
-        for i in range(frames.count):
-            seen = posed(state, read(i), i)
-            frames = _again(state, frames, i, known, seen.frame)
-            if frames.mapped[i]:
-                yield seen._replace(T_world_cam=frames.T_world_body[i] @ state.T_body_cam)
-
-    made = jax.block_until_ready(rebuilt_map(state, registered()))
-    return state._replace(frames=frames, map=made)
+    for i in range(1, frames.count):
+        frames = _again(state, frames, i, known, posed(state, read(i), i).frame)
+    state = state._replace(frames=frames)
+    mapped = np.flatnonzero(frames.mapped).tolist()
+    made = rebuilt_map(state, (posed(state, read(i), i) for i in mapped))
+    return state._replace(map=jax.block_until_ready(made))
 
 
 def _again(state: SlamState, frames: Frames, i: int, known: Int[np.ndarray, " n"], frame: Frame) -> Frames:
-    """The frames with one of them registered to the map of `state`, if that is good; the first one stays."""
+    """The frames with one of them registered to the map of `state`, if that is good."""
     guess = _guess(state.frames, i, known)
-    if i == 0 or guess is None:
+    if guess is None:
         return frames
     T_world_body, sigma = guess
     tracked = registered_near(state, i, T_world_body, sigma, to_device(frame))
