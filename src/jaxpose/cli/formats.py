@@ -81,8 +81,9 @@ def all_formats() -> tuple[Row, ...]:
 
 def _written(title: str) -> tuple[str, str]:
     """The command that writes a format, and what its test opens it with."""
-    names = [name for name, (of, _) in _EXPORTS.items() if of == title]
-    if not names:
+    named = [(str(name), tested) for name, (of, tested) in _EXPORTS.items() if of == title]
+    if not named:
         return "", ""
-    named = ", ".join(f"`{name}`" for name in (f"export --format {names[0]}", *names[1:]))
-    return named, _EXPORTS[names[0]][1]
+    first, tested = named[0]
+    commands = [f"export --format {first}", *(name for name, _ in named[1:])]
+    return ", ".join(f"`{command}`" for command in commands), tested

@@ -200,6 +200,7 @@ def run(
     config: SlamConfig = _DEFAULT,
     on_frame: Callable[[Progress], None] | None = None,
     state: SlamState | None = None,
+    on_refined: Callable[[int, int], None] | None = None,
 ) -> SlamResult:
     """Track every frame of an RGB-D recording and map what it sees (Ma et al. 2024, section 3.4).
 
@@ -211,6 +212,7 @@ def run(
         config: settings of the run.
         on_frame: called after every frame.
         state: where an earlier run of the same recording stood, to go on from there.
+        on_refined: called at the end with how many frames are registered once more, and how many there are.
 
     Raises:
         DataError: where the recording cannot be tracked: fewer than two frames, no depth in the first, an IMU
@@ -218,7 +220,7 @@ def run(
     """
     state = track_all(recording, config, on_frame, state)
     if config.uses_refinement:
-        state = refined(state, recording.read)
+        state = refined(state, recording.read, on_refined)
     return _finish(state, recording.read, recording.imu)
 
 

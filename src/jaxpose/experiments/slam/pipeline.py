@@ -27,6 +27,8 @@ from jaxpose.slam import ImuMode, Progress, estimate_line_delay
 from jaxpose.slam.checkpoint import load as load_checkpoint
 from jaxpose.slam.pipeline import run as track
 
+_END = Update("fitting the continuous trajectory, texturing the map")
+
 Errors = Float[np.ndarray, " n"]  # [m] translation error of every frame; NaN without ground truth
 
 
@@ -128,9 +130,12 @@ def _single(
         keep(progress)
         on_update(tracking_update(mode, progress))
         if progress.index == progress.count - 1:
-            on_update(Update("fitting the continuous trajectory, texturing the map"))
+            on_update(_END)
 
-    result = track(recording, config, on_frame, state)
+    def on_refined(done: int, total: int) -> None:
+        on_update(_END if done == total else Update("registering to the whole map", done, total, "frames"))
+
+    result = track(recording, config, on_frame, state, on_refined)
     found, errors = write_run(folder, options, source, result, on_update)
     results = {
         "experiment": experiment,

@@ -5,6 +5,8 @@ its keyframes. A frame in doubt was registered beside its place, or not at all: 
 frames around it that are in none.
 """
 
+from collections.abc import Callable
+
 import jax
 import numpy as np
 from jaxtyping import Float, Int
@@ -23,12 +25,15 @@ _FASTER = 0.1  # [m/s, rad/s] one sigma of the speed between frames that are in 
 _FOUND = "loss", "depth_error", "colour_error", "valid", "sigma"  # of a registration
 
 
-def refined(state: SlamState, read: FrameReader) -> SlamState:
+def refined(
+    state: SlamState, read: FrameReader, on_frame: Callable[[int, int], None] | None = None
+) -> SlamState:
     """The run after all its frames, with poses and a map that agree.
 
     Args:
         state: a run that maps by integration. Its map is no longer usable.
         read: all of its frames, each once and those that are mapped twice.
+        on_frame: called with how many are registered, and how many there are.
 
     Returns:
         The state. Frames that were in doubt and are found are so no more.
@@ -36,6 +41,8 @@ def refined(state: SlamState, read: FrameReader) -> SlamState:
     frames, known = state.frames, np.flatnonzero(~state.frames.doubted)
     for i in range(1, frames.count):
         frames = _again(state, frames, i, known, posed(state, read(i), i).frame)
+        if on_frame is not None:
+            on_frame(i + 1, frames.count)
     state = state._replace(frames=frames)
     mapped = np.flatnonzero(frames.mapped).tolist()
     made = rebuilt_map(state, (posed(state, read(i), i) for i in mapped))
