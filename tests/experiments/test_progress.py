@@ -73,7 +73,18 @@ def test_time_left_is_that_of_the_steps_done_here():
 @pytest.mark.slow
 def test_a_run_is_never_silent(tmp_path):
     """The run folder first, and then no five seconds without a line."""
-    command = [sys.executable, "-u", "-m", "jaxpose", "slam", "--smoke", "--out", tmp_path / "run"]
+    command = [
+        sys.executable,
+        "-u",
+        "-m",
+        "jaxpose",
+        "slam",
+        "--smoke",
+        "--refine",
+        "all",
+        "--out",
+        tmp_path / "run",
+    ]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
     assert process.stderr is not None
     times, lines = [time.perf_counter()], []

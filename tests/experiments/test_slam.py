@@ -294,7 +294,7 @@ def test_imu_is_simulated_before_thinning(folder):
         (["--no-loops", "--loop.drift", "2"], r"--loop\.drift: has no effect where no loops are looked for"),
         (["--features", "none", "--no-loops"], r"--loops: has no effect without features and a fused map"),
         (
-            ["--map.method", "gradient", "--no-refine"],
+            ["--map.method", "gradient", "--refine", "all"],
             r"--refine: has no effect with --track\.method or --map",
         ),
         (["--loop.candidates", "0"], r"loop\.candidates: expected a .*number"),

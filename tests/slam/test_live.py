@@ -33,7 +33,7 @@ def live(walk, config, start, **first):
 @pytest.mark.slow
 @pytest.mark.parametrize(("imu", "start"), [("none", 1.7e9), ("combined", 0.0)])
 def test_frames_one_by_one_end_where_a_recording_does(walk, imu, start):
-    config = SlamConfig(imu=imu, voxel=0.05, refine=False)
+    config = SlamConfig(imu=imu, voxel=0.05)
     expected = slam.run(walk, config)
     states = live(walk, config, start, T_world_cam=walk.T_world_cam[0])
     found = slam.finish(states[-1])

@@ -165,8 +165,9 @@ class SlamConfig:
     features: Literal["orb", "none"] = "orb"
     # Places that are seen again correct the trajectory and the map (with features and a fused map).
     loops: bool = True
-    # At the end frames are registered once more, and the map is made anew (a fused map and `gauss_newton`).
-    refine: bool = True
+    # Frames that are registered once more at the end, to the map of all: those in doubt, between their
+    # neighbours; or all, and the map is made anew (`gauss_newton` and a fused map).
+    refine: Literal["doubted", "all", "none"] = "doubted"
     # offset, extrinsics: by the final pass over a run with an IMU, beside biases and gravity; line-delay: by
     # three runs before it.
     estimate: tuple[Literal["offset", "extrinsics", "line-delay"], ...] = ()
@@ -217,7 +218,7 @@ class SlamConfig:
     @property
     def uses_refinement(self) -> bool:
         """Whether frames are registered again at the end: where a map can be integrated anew."""
-        return self.refine and self.track.method == "gauss_newton" and self.map.method == "fused"
+        return self.refine != "none" and self.track.method == "gauss_newton" and self.map.method == "fused"
 
     @property
     def uses_field(self) -> bool:

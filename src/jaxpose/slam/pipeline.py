@@ -184,7 +184,7 @@ def step(
 def finish(state: SlamState) -> SlamResult:
     """The whole run so far: its poses, its map with fine colour, one continuous field through all poses.
 
-    Frames are not registered again, as `run` does at its end: only the images of keyframes are kept.
+    No frame is registered again, as `run` does at its end: only the images of keyframes are kept.
 
     Args:
         state: a run of at least two frames, made by `step`; it stays usable.
@@ -204,7 +204,7 @@ def run(
 ) -> SlamResult:
     """Track every frame of an RGB-D recording and map what it sees (Ma et al. 2024, section 3.4).
 
-    At its end frames are registered once more, to the map of all of them (`config.refine`).
+    At its end frames in doubt are registered once more, to the map of all of them (`config.refine`).
 
     Args:
         recording: frames with times, and what is known beside them. The world's frame is that of its first

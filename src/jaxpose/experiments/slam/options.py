@@ -141,7 +141,7 @@ class Options:
             check_unused(self, names, "where no loops are looked for")
         if not replace(slam, loops=True).uses_loops:
             check_unused(self, ("slam.loops",), "without features and a fused map")
-        if not replace(slam, refine=True).uses_refinement:
+        if not replace(slam, refine="all").uses_refinement:
             check_unused(self, ("slam.refine",), "with --track.method or --map.method gradient")
         if slam.map.method == "fused":
             check_unused(self, [f"slam.map.{n}" for n in _RENDERED_MAPPING], "with --map.method fused")

@@ -1,8 +1,8 @@
-"""The end of a run: frames are registered once more, to the map that all of them made, and it is made anew.
+"""The end of a run: frames are registered once more, to the map that all of them made.
 
-While a run goes on, a frame is registered to what was mapped before it, and a loop moves it only along with
-its keyframes. A frame in doubt was registered beside its place, or not at all: it is looked for between the
-frames around it that are in none.
+A frame in doubt was registered beside its place, or not at all: it is looked for between the frames around it
+that are in none. Where all frames are asked for, each is registered to what was mapped after it too, and the
+map is made anew.
 """
 
 from collections.abc import Callable
@@ -31,19 +31,23 @@ def refined(
     """The run after all its frames, with poses and a map that agree.
 
     Args:
-        state: a run that maps by integration. Its map is no longer usable.
-        read: all of its frames, each once and those that are mapped twice.
-        on_frame: called with how many are registered, and how many there are.
+        state: a run that maps by integration. Its map is no longer usable, if all frames are asked for.
+        read: its frames.
+        on_frame: called with how many are registered, and how many are to be.
 
     Returns:
         The state. Frames that were in doubt and are found are so no more.
     """
     frames, known = state.frames, np.flatnonzero(~state.frames.doubted)
-    for i in range(1, frames.count):
+    everything = state.config.refine == "all"
+    chosen = np.arange(1, frames.count) if everything else np.flatnonzero(frames.doubted)
+    for done, i in enumerate(chosen.tolist()):
         frames = _again(state, frames, i, known, posed(state, read(i), i).frame)
         if on_frame is not None:
-            on_frame(i + 1, frames.count)
+            on_frame(done + 1, len(chosen))
     state = state._replace(frames=frames)
+    if not everything:
+        return state
     mapped = np.flatnonzero(frames.mapped).tolist()
     made = rebuilt_map(state, (posed(state, read(i), i) for i in mapped))
     return state._replace(map=jax.block_until_ready(made))
