@@ -2,7 +2,7 @@
 
 Blobs of the three colour channels, described by SIFT (Lowe 2004; square roots of histograms, Arandjelovic
 and Zisserman 2012), matched by the ratio test in both directions, kept where an essential matrix explains
-them (Nister 2004, RANSAC). Detection, description and RANSAC are OpenCV's.
+them (Nister 2004, RANSAC). Detection, description and RANSAC (its USAC) are OpenCV's.
 """
 
 from collections.abc import Callable
@@ -148,9 +148,8 @@ def _verified(
     none = np.zeros(0, int)
     if len(a) < FEWEST:
         return none
-    cv2.setRNGSeed(0)
     _, chosen = cv2.findEssentialMat(
-        a, b, np.eye(3), method=cv2.RANSAC, prob=0.9999, threshold=OUTLIER_PX / focal, maxIters=1000
+        a, b, np.eye(3), method=cv2.USAC_ACCURATE, prob=0.9999, threshold=OUTLIER_PX / focal
     )
     kept = none if chosen is None else np.flatnonzero(chosen)
     return kept if len(kept) >= max(FEWEST, _AGREE * len(a)) else none
