@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxpose.datasets.events.stream import Block
 
-_TIME_HIGH = 8
+_TIME_HIGH, _TIME_LOW = 8, 6
 
 
 class _Clock:
@@ -23,20 +23,14 @@ class _Clock:
         self.high = self.turns = 0
         self.begun = False
 
-    def at(self, rows: np.ndarray, high: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """For each of `count` words the high part with its turns, and the row where it last changed.
-
-        `rows` are the words that state a high part; -1 is before them.
-        """
+    def advance(self, high: np.ndarray) -> np.ndarray:
+        """The high part with its turns: before any of those that words state, then after each."""
         fell = np.diff(high, prepend=self.high if self.begun else high[:1]) <= -(self.turn // 2)
         whole = high + self.turn * (self.turns + np.cumsum(fell))
         before = self.high + self.turn * self.turns
         if len(high):
             self.high, self.turns, self.begun = int(high[-1]), self.turns + int(fell.sum()), True
-        table = np.concatenate([[before], whole])
-        changed = np.concatenate([[-1], np.where(np.diff(table) != 0, rows, -1)])
-        index = np.searchsorted(rows, np.arange(count), side="right")
-        return table[index], np.maximum.accumulate(changed)[index]
+        return np.concatenate([[before], whole])
 
 
 class Evt2:
@@ -49,22 +43,21 @@ class Evt2:
 
     def decode(self, words: np.ndarray) -> Block:
         """Events of the words; those before the first time are counted in `dropped`."""
-        kind = words >> 28
-        rows = np.flatnonzero(kind == _TIME_HIGH)
-        begun = self.clock.begun
-        high, _ = self.clock.at(rows, (words[rows] & 0xFFFFFFF).astype(np.int64), len(words))
-        events = np.flatnonzero(kind <= 1)
-        events = self._dated(events, begun, rows)
+        events, high = self._dated((words >> 28).astype(np.uint8), words)
         word = words[events]
-        t = (high[events] << 6) | ((word >> 22) & 0x3F).astype(np.int64)
+        t = (high << 6) | ((word >> 22) & 0x3F)
         return Block(t, (word >> 11) & 0x7FF, word & 0x7FF, (word >> 28).astype(np.int8))
 
-    def _dated(self, events: np.ndarray, begun: bool, rows: np.ndarray) -> np.ndarray:
-        """Rows of events that have a time."""
-        first = 0 if begun else (int(rows[0]) if len(rows) else len(events) and int(events[-1]) + 1)
-        dated = events[events >= first]
-        self.dropped += len(events) - len(dated)
-        return dated
+    def _dated(self, kind: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Rows of events that have a time, and its high part."""
+        says, begun = np.flatnonzero(kind == _TIME_HIGH), self.clock.begun
+        table = self.clock.advance((upper[says] & 0xFFFFFFF).astype(np.int64))
+        events = np.flatnonzero(kind <= 1)
+        if not begun:
+            dated = events >= (says[0] if len(says) else len(kind))
+            self.dropped += int((~dated).sum())
+            events = events[dated]
+        return events, _held(table, says, len(kind))[events]
 
 
 class Evt21(Evt2):
@@ -74,17 +67,13 @@ class Evt21(Evt2):
 
     def decode(self, words: np.ndarray) -> Block:
         """Events of the words, as `Evt2` does."""
-        kind = (words >> np.uint64(60)).astype(np.int8)
+        kind = (words >> np.uint64(60)).astype(np.uint8)
         upper = (words >> np.uint64(32)).astype(np.uint32)
-        rows = np.flatnonzero(kind == _TIME_HIGH)
-        begun = self.clock.begun
-        high, _ = self.clock.at(rows, (upper[rows] & 0xFFFFFFF).astype(np.int64), len(words))
-        vectors = np.flatnonzero((kind == 0) | (kind == 1))
-        vectors = self._dated(vectors, begun, rows)
+        vectors, high = self._dated(kind, upper)
         row, bit = _set_bits(words[vectors].astype(np.uint32), 32)
         vectors = vectors[row]
         word = upper[vectors]
-        t = (high[vectors] << 6) | ((word >> 22) & 0x3F).astype(np.int64)
+        t = (high[row] << 6) | ((word >> 22) & 0x3F)
         return Block(t, ((word >> 11) & 0x7FF) + bit, word & 0x7FF, kind[vectors])
 
 
@@ -113,33 +102,63 @@ class Evt3:
 
     def decode(self, words: np.ndarray) -> Block:
         """Events of the words; those before the first time or row are counted in `dropped`."""
-        kind, value, count = words >> 12, (words & 0xFFF).astype(np.int64), len(words)
-        rows = np.flatnonzero(kind == _TIME_HIGH)
-        first = 0 if self.clock.begun else (int(rows[0]) if len(rows) else count)
-        high, changed = self.clock.at(rows, value[rows], count)
-        last_low, low = _latest(kind == 6, value, self.state.low)
-        low = np.where(changed > last_low, 0, low)  # until the next low part, after a new high one
-        last_y, y = _latest(kind == 0, value & 0x7FF, self.state.y)
-        last_base, base = _latest(kind == 3, value, self.state.base | (self.state.polarity << 11))
+        kind, begun = (words >> 12).astype(np.uint8), self.clock.begun
+        says, rows = np.flatnonzero((kind == _TIME_LOW) | (kind == _TIME_HIGH)), np.flatnonzero(kind == 0)
+        is_high = kind[says] == _TIME_HIGH
+        times, ys = self._times(words[says], is_high), np.append(np.int32(self.state.y), words[rows] & 0x7FF)
+        self.state = self.state._replace(y=int(ys[-1]))
+        at, x, polarity = self._pixels(kind, words)
+        t, y = _held(times, says, len(words))[at], _held(ys, rows, len(words))[at]
+        if not begun or ys[0] < 0:
+            first = 0 if begun else int(says[is_high.argmax()]) if is_high.any() else len(words)
+            dated = (at >= first) & (y >= 0)
+            self.dropped += int((~dated).sum())
+            t, x, y, polarity = t[dated], x[dated], y[dated], polarity[dated]
+        return Block(t, x, y, polarity.astype(np.int8))
+
+    def _times(self, stated: np.ndarray, is_high: np.ndarray) -> np.ndarray:
+        """The clock before any of the words that state a part of it, and after each."""
+        value, rows = (stated & 0xFFF).astype(np.int64), np.flatnonzero(is_high)
+        highs = self.clock.advance(value[rows])
+        high = _held(highs, rows, len(value))
+        # A high part that changes makes the low one 0, until the next of those; else it leaves it as it was.
+        behind_low = (rows > 0) & ~is_high[rows - 1]
+        changes = np.diff(highs) != 0
+        renews, low = changes | behind_low, np.where(changes, 0, value[rows - 1])
+        last = np.maximum.accumulate(np.where(renews, np.arange(len(rows)), -1))
+        value[rows] = np.where(last < 0, self.state.low, low[last])
+        before = (int(highs[0]) << 12) | self.state.low
+        if len(value):
+            self.state = self.state._replace(low=int(value[-1]))
+        return np.append(before, (high << 12) | value)
+
+    def _pixels(self, kind: np.ndarray, words: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Rows of the events' words, columns and polarities: single ones, and those of vectors."""
+        has_vectors = ((kind >= 3) & (kind <= 5)).any()
+        if not has_vectors:
+            at = np.flatnonzero(kind == 2)
+            value = words[at]
+            return at, value & 0x7FF, (value >> 11) & 1
+        rows = np.flatnonzero((kind >= 2) & (kind <= 5))
+        kind, value = kind[rows], (words[rows] & 0xFFF).astype(np.int64)
+        last, base = _latest(kind == 3, value, self.state.base | (self.state.polarity << 11))
         # Every vector moves the column on by its own width.
         width = np.where(kind == 4, 12, np.where(kind == 5, 8, 0))
         moved = np.cumsum(width)
-        before = moved - width
-        start = (base & 0x7FF) + before - np.where(last_base < 0, 0, moved[np.maximum(last_base, 0)])
-        if count:
-            self.state = _Evt3State(int(low[-1]), int(y[-1]), int(start[-1] + width[-1]), int(base[-1] >> 11))
-        # Single events and vectors, in the order of their words.
+        start = (base & 0x7FF) + moved - width - np.where(last < 0, 0, moved[np.maximum(last, 0)])
+        self.state = self.state._replace(base=int(start[-1] + width[-1]), polarity=int(base[-1] >> 11))
         bits = np.where(kind == 2, 1, np.where(kind == 4, value, np.where(kind == 5, value & 0xFF, 0)))
         holders = np.flatnonzero(bits)
         row, bit = _set_bits(bits[holders].astype(np.uint32), 12)
-        at = holders[row]
-        dated = (at >= first) & (y[at] >= 0)
-        self.dropped += int((~dated).sum())
-        at, bit = at[dated], bit[dated]
-        single = kind[at] == 2
-        x = np.where(single, value[at] & 0x7FF, start[at] + bit)
-        polarity = np.where(single, value[at] >> 11, base[at] >> 11)
-        return Block((high[at] << 12) | low[at], x, y[at], polarity.astype(np.int8))
+        row = holders[row]
+        single = kind[row] == 2
+        x = np.where(single, value[row] & 0x7FF, start[row] + bit)
+        return rows[row], x, np.where(single, value[row] >> 11, base[row] >> 11)
+
+
+def _held(values: np.ndarray, rows: np.ndarray, count: int) -> np.ndarray:
+    """For each of `count` words the value that holds: the first before `rows`, then each from its row on."""
+    return np.repeat(values, np.diff(rows, prepend=0, append=count))
 
 
 def _latest(states: np.ndarray, value: np.ndarray, before: int) -> tuple[np.ndarray, np.ndarray]:

@@ -12,7 +12,7 @@ from jaxpose.datasets.events.stream import BLOCK, Block, Stream, stated_size
 from jaxpose.errors import DataError
 
 _Decoder = Evt2 | Evt3
-_BYTES = 1 << 21  # read at a time
+_BYTES = 1 << 18  # read at a time
 _LONGEST_HEADER = 1 << 16
 _LAYOUT_WORDS = 4096  # that tell in which order the halves of EVT 2.1's words are
 _CD = (0x00, 0x0C)  # types of events in DAT that are changes of contrast
