@@ -93,10 +93,10 @@ def refusal(path):
 def test_a_wrong_path_is_told_what_is_there(tmp_path):
     (tmp_path / "empty").mkdir()
     (tmp_path / "file").touch()
-    (tmp_path / "desk.zip").touch()
+    (tmp_path / "desk.zip").write_bytes(b"PK\x03\x04")
     assert refusal(tmp_path / "empty") == "an empty folder"
     assert refusal(tmp_path / "file") == "a file"
-    assert refusal(tmp_path / "desk.zip") == "a file to be unpacked first"
+    assert refusal(tmp_path / "desk.zip") == "a zip archive to be unpacked first"
     assert refusal(tmp_path / "nowhere") == "nothing"
     assert refusal(tmp_path) == "desk.zip, empty, file"
 

@@ -146,7 +146,7 @@ KITTI_LINE = "1 0 0 0 0 1 0 0 0 0 1 0\n"
             "-9e18" + TUM_LINE[1:] + TUM_LINE,
             "trajectory: expected timestamps until the year 2200, got -9e.18 s",
         ),
-        (trajectories.read_tum, "\x00\x89PNG\n", "trajectory: expected lines of 8 numbers .*, got none"),
+        (trajectories.read_tum, "\x00\x89PNG\n", "trajectory: expected text, got bytes that are none"),
         (trajectories.read_euroc, EUROC_LINE + "1 2 3\n", "trajectory:2: expected 17 numbers .*, got 1"),
         (trajectories.read_euroc, EUROC_LINE[:-1] + ",0\n", "trajectory:1: expected 17 numbers .*, got 9"),
         (

@@ -13,10 +13,11 @@ from PIL import Image
 from jaxpose.errors import DataError
 from jaxpose.files.schema import FARTHEST_M
 from jaxpose.files.tables import read_numbers
+from jaxpose.files.texts import archive_kind
 from jaxpose.files.untrusted import opened_image
 from jaxpose.geometry.rigid import nearest_rotation
 
-SUFFIXES = (".png", ".jpg", ".jpeg")
+SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".ppm", ".pgm")
 INTRINSICS = "camera-intrinsics.txt"
 _NONE = 65535  # like 0, no measurement: sensors and renderers clip what is too far to it
 _LARGEST_ENTRY = 1e3  # of what is made a rotation
@@ -75,6 +76,8 @@ def read_color(file: Path, size: tuple[int, int] | None = None) -> np.ndarray:
 def read_depth(file: Path, per_metre: float = 1000.0) -> np.ndarray:
     """(height, width) float32 [m] of 16-bit counts, 0 where there is none (0 or 65535)."""
     counts = open_image(file, np.asarray)
+    if counts.dtype.kind in "ui" and counts.itemsize > 1 and 0 <= counts.min() and counts.max() <= _NONE:
+        counts = counts.astype(np.uint16)  # of either order of bytes, and PGM's, which Pillow widens
     if counts.dtype != np.uint16 or counts.ndim != 2:
         found = f"{counts.dtype} of shape {counts.shape}"
         raise DataError(f"{file}: expected {depth_unit(per_metre)}, one channel of 16 bits, got {found}")
@@ -238,6 +241,8 @@ def some(items: Sequence[str], most: int = 5) -> str:
 
 def found(path: Path) -> str:
     """What is at a path where a folder with files was expected, for a message of one line."""
+    if path.is_file() and (kind := archive_kind(path)) is not None:
+        return f"a {kind} archive to be unpacked first"
     if not path.is_dir():
         return "a file" if path.exists() else "nothing"
     return some(sorted(file.name for file in path.iterdir())) or "an empty folder"

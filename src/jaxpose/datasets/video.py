@@ -1,5 +1,6 @@
 """Videos (mp4, mkv) through PyAV: frames decoded when asked for."""
 
+import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from fractions import Fraction
@@ -114,5 +115,5 @@ class Video:
 
 
 def _damaged(path: Path, error: Exception) -> DataError:
-    words = " ".join(str(error).split()) or type(error).__name__
+    words = re.sub(r"^\[Errno -?\d+\] |: '[^']*'$", "", " ".join(str(error).split())) or type(error).__name__
     return DataError(f"{path}: expected a video, got {words[:200]}")

@@ -15,9 +15,9 @@ POSE = {
 }
 _UNITS: dict[Unit, str] = {
     "s": r"s|secs?|seconds?",
-    "ms": r"ms|msecs?|milliseconds?|millis",
-    "us": r"us|usecs?|microseconds?|micros",
-    "ns": r"ns|nsecs?|nanoseconds?|nanos",
+    "ms": r"ms|msecs?|millis(ec)?s?|milliseconds?",
+    "us": r"us|usecs?|micros(ec)?s?|microseconds?",
+    "ns": r"ns|nsecs?|nanos(ec)?s?|nanoseconds?",
 }
 _LONGEST_HEADER = 4000  # characters; what is longer is no list of names
 _PATHS = ("position", "orientation", "translation", "rotation", "linear_acceleration", "angular_velocity")
@@ -49,6 +49,24 @@ def named_columns(table: Table, wanted: Mapping[str, str]) -> Named | None:
         if named is not None and len(_split(text, table.separator)) == len(table.words(0)):
             return named
     return None
+
+
+def named_parts(header: str, table: Table, wanted: Mapping[str, str]) -> set[str]:
+    """The quantities that a header has names for.
+
+    Args:
+        header: A line above the numbers.
+        table: It is of.
+        wanted: As in `named_columns`.
+
+    Returns:
+        Their names; none for a header of another number of columns.
+    """
+    names = _split(header, table.separator) if len(header) <= _LONGEST_HEADER else []
+    if len(names) != len(table.words(0)):
+        return set()
+    plain = [re.sub(r"^(t|time|timestamps?|stamp)_\w+$", r"\1", _plain(name)[0]) for name in names]
+    return {quantity for quantity, form in wanted.items() if any(re.fullmatch(form, name) for name in plain)}
 
 
 def match_names(names: Sequence[str], wanted: Mapping[str, str]) -> Named | None:

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from jaxpose.errors import DataError
 from jaxpose.files import atomic
 from jaxpose.files.schema import numbers
+from jaxpose.files.texts import read_text
 from jaxpose.files.untrusted import read_yaml
 from jaxpose.geometry import rigid
 
@@ -37,7 +38,7 @@ def write_camchain(path: Path | str, found: CameraImu) -> None:
 
 def is_camchain(path: Path | str) -> bool:
     """Whether a file names `T_cam_imu`."""
-    return "T_cam_imu" in Path(path).read_text(encoding="utf-8-sig", errors="replace")
+    return "T_cam_imu" in read_text(Path(path))
 
 
 def read_camchain(path: Path | str) -> CameraImu:

@@ -7,6 +7,7 @@ is refused.
 """
 
 import math
+import re
 from collections.abc import Iterator, Sequence
 from decimal import Decimal
 from operator import lt
@@ -19,6 +20,7 @@ from jaxtyping import Float
 from jaxpose.errors import DataError
 from jaxpose.files import timestamps
 from jaxpose.files.schema import FARTHEST_M
+from jaxpose.files.texts import read_text
 from jaxpose.files.timestamps import POSES, Stamps, Steps, Unit, format_ns, to_decimal, to_stamps, units
 
 _FEW = 50  # rows, of which each is sooner read by itself
@@ -77,7 +79,8 @@ def read_table(path: Path) -> Table:
     comments: list[tuple[int, str]] = []
     lines, rows = [], []
     separator = None
-    for number, line in _all_lines(path):
+    for number, quoted in _all_lines(path):
+        line = quoted.replace('"', "") or "#"
         if line[0] in "#%":
             comments.append((number, line.lstrip("#%").strip()))
         if not lines:
@@ -94,9 +97,8 @@ def read_table(path: Path) -> Table:
 
 def find_separator(path: Path) -> str | None:
     """The separator of a table's first row, as `read_table` finds it."""
-    with path.open(encoding="utf-8-sig", errors="replace") as lines:
-        rows = (line for line in map(str.strip, lines) if line and line[0] not in "#%" and _is_row(line))
-        return _separator(next(rows, ""))
+    rows = (line for _, line in _all_lines(path) if line[0] not in "#%" and _is_row(line))
+    return _separator(next(rows, ""))
 
 
 def stamped_rows(
@@ -296,7 +298,7 @@ def read_stamped_names(
     Args:
         path: The file.
         unit: Of the timestamps by the file's format; another is found by their size and steps.
-        separator: Between the two; by default blanks.
+        separator: Between the two; by default blanks, a comma or both.
 
     Returns:
         Timestamps in whole ns, and the names, which may hold blanks.
@@ -307,7 +309,7 @@ def read_stamped_names(
     wanted = f"a timestamp in {'seconds' if unit == 's' else 'ns'} and a file name"
     lines, words, names = [], [], []
     for number, line in numbered_lines(path):
-        word, *rest = line.split(separator, maxsplit=1)
+        word, *rest = line.split(separator, 1) if separator else re.split(r"[,;\s]+", line, maxsplit=1)
         if not rest or not rest[0].strip():
             raise DataError(f"{path}:{number}: expected {wanted}, got {line[:60]!r}")
         lines.append(number)
@@ -356,7 +358,7 @@ def format_rows(rows: Float[np.ndarray, "n c"]) -> str:
 
 def _all_lines(path: Path) -> Iterator[tuple[int, str]]:
     """Lines with something on them, without blanks around them, and their numbers from 1."""
-    text = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
+    text = read_text(path).splitlines()
     return ((k, stripped) for k, line in enumerate(text, 1) if (stripped := line.strip()))
 
 

@@ -19,6 +19,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from jaxpose.errors import DataError
+from jaxpose.files.texts import read_text
 
 _TEXT_BYTES = 256 << 20  # JSON; its objects take some twenty times as much
 _YAML_BYTES = 100_000  # data sheets of sensors are a few kB, and its parser is slow
@@ -33,6 +34,7 @@ _DEFLATE = 1032  # how far deflate can compress
 _PIXELS = 100_000_000  # of one image
 _PIXELS_PER_BYTE = 4096  # how far PNG and JPEG can
 _FORMATS = ("PNG", "JPEG", "PPM", "BMP", "TIFF", "WEBP")
+_PLAIN = {"UnidentifiedImageError": "bytes of no kind that is known", "RecursionError": "nesting without end"}
 
 
 @runtime_checkable
@@ -336,7 +338,7 @@ def _text(path: Path, most: int) -> str:
     size = path.stat().st_size
     if size > most:
         raise ValueError(f"{size} bytes, more than {most}")
-    return path.read_text(encoding="utf-8-sig", errors="replace")
+    return read_text(path)
 
 
 def _numeric(value: Any) -> Any:
@@ -391,8 +393,8 @@ def opened_image(path: Path | str) -> Iterator[Any]:
 
 
 def _words(error: Any) -> str:
-    """An error in one short line."""
+    """An error in one short line; of those whose own words say little, in others."""
     if isinstance(error, KeyError):
         return f"no {error}"
     text = " ".join(str(error).split()) or type(error).__name__
-    return "nesting without end" if isinstance(error, RecursionError) else text[:200]
+    return _PLAIN.get(type(error).__name__, text[:200])

@@ -283,7 +283,7 @@ MIRROR = np.diag([1.0, 1, -1, 1]).tolist()
         (spoil(cx=float("nan")), r"expected a number for cx, got nan"),
         (spoil(w=W + 1, h=H), rf"r_0.png: expected {W + 1}x{H}, as transforms.json states, got {W}x{H}"),
         (other_size, rf"r_2.png: expected {W}x{H}, the size of the first, got {W}x{H + 1}"),
-        (damaged, r"r_2.png: expected an image, got cannot identify"),
+        (damaged, r"r_2.png: expected an image, got bytes of no kind"),
         (deep, r"r_2.png: expected an image, got pixels of kind I;16, not of 8 bits"),
         (spoil_frame("transform_matrix", NAN), r"images/r_2: expected a finite pose, got NaN"),
         (spoil_frame("transform_matrix", MIRROR), r"images/r_2: expected a rotation, got a matrix"),

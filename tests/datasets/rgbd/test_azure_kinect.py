@@ -6,7 +6,7 @@ from helpers import azure_kinect
 from scipy.spatial.transform import Rotation
 
 from jaxpose.datasets.rgbd import registry
-from jaxpose.datasets.rgbd.rational import pixel_rays
+from jaxpose.datasets.rgbd.rational import pixel_rays, undistortion
 from jaxpose.errors import DataError
 from jaxpose.geometry import rigid
 from jaxpose.geometry.camera import Camera
@@ -65,6 +65,29 @@ def test_rays_lead_back_by_the_formula():
     np.testing.assert_allclose(v, np.arange(288)[:, None] + np.zeros((1, 320)), atol=1e-4)
     edge = pixel_rays(Camera(12.0, 12.0, 32.0, 24.0, 64, 48), np.array([-0.3, 0, 0, 0, 0, 0, 0, 0]))
     assert np.isnan(edge[0, 0]).all() and np.isfinite(edge[24, 32]).all()  # no ray bends that far out
+
+
+def test_a_fisheye_is_undone_by_its_formula():
+    """OpenCV's documentation, "Fisheye camera model"."""
+    k = np.array([0.05, -0.01, 0.002, 0.0])
+    camera = Camera(30.0, 31.0, 31.5, 23.5, 64, 48)
+    rays = pixel_rays(camera, k, fisheye=True)
+    r = np.hypot(rays[..., 0], rays[..., 1])
+    theta = np.arctan(r)
+    bent = theta * (1 + k[0] * theta**2 + k[1] * theta**4 + k[2] * theta**6) / np.maximum(r, 1e-12)
+    seen = np.isfinite(bent)
+    assert seen.mean() > 0.9
+    u, v = 30 * rays[..., 0] * bent + 31.5, 31 * rays[..., 1] * bent + 23.5
+    np.testing.assert_allclose(u[seen], np.broadcast_to(np.arange(64), (48, 64))[seen], atol=0.1)
+    np.testing.assert_allclose(v[seen], np.broadcast_to(np.arange(48)[:, None], (48, 64))[seen], atol=0.1)
+    # The pinhole's image takes each pixel from where the lens has its ray.
+    maps = undistortion(camera, k, fisheye=True)
+    x, y = (50 - 31.5) / 30, (40 - 23.5) / 31
+    r = np.hypot(x, y)
+    theta = np.arctan(r)
+    bent = theta * (1 + k[0] * theta**2 + k[1] * theta**4 + k[2] * theta**6) / r
+    assert maps.column[40, 50] == pytest.approx(30 * x * bent + 31.5, abs=1e-3)
+    assert maps.row[40, 50] == pytest.approx(31 * y * bent + 23.5, abs=1e-3)
 
 
 def test_the_imu_is_on_the_frames_clock(tmp_path):

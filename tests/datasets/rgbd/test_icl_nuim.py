@@ -144,7 +144,7 @@ LINE = r"associations.txt:2: expected N depth/N.png N rgb/N.png \(or rgb before 
         (TRUTH, "# a\n1 0 0 0 0 0 0 1\n1.5 0 0 0 0 0 0 1\n", f"{TRUTH}: expected frame numbers, got 1.5"),
         (TRUTH, "1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", f"{TRUTH}:2: expected a timestamp"),
         ("camera-intrinsics.txt", "30 0 15\n0 -31 11\n0 0 1\n", "intrinsics.txt: expected fx 0 cx.*0 -31 11"),
-        ("rgb/0.png", "text", "rgb/0.png: expected an image, got cannot identify"),
+        ("rgb/0.png", "text", "rgb/0.png: expected an image, got bytes of no kind"),
     ],
 )
 def test_unusable_files_are_named(living_room, file, content, message):

@@ -43,6 +43,25 @@ def test_stray_scanner(tmp_path, walk, save):
     assert "colour resized from 64x48 to 32x24, the size of depth" in recording.notes
 
 
+def test_another_case_and_a_folder_in_a_zip_are_found(tmp_path, walk, save):
+    (tmp_path / "stray").mkdir()
+    folder = phones.stray_scanner(tmp_path / "stray", walk, save)
+    (folder / "rgb.mp4").rename(folder / "RGB.MP4")
+    check_frames(load_recording(folder), walk, most=4)
+    phones.record3d(tmp_path / "a.r3d", walk)
+    with (
+        zipfile.ZipFile(tmp_path / "a.r3d") as archive,
+        zipfile.ZipFile(tmp_path / "shared.zip", "w") as other,
+    ):
+        for name in archive.namelist():
+            other.writestr(f"walk/{name}", archive.read(name))
+    assert find_format(tmp_path / "shared.zip") == "record3d"
+    np.testing.assert_array_equal(
+        load_recording(tmp_path / "shared.zip").read(3).depth,
+        load_recording(tmp_path / "a.r3d").read(3).depth,
+    )
+
+
 @pytest.mark.parametrize(
     "force, up_in_camera",
     [

@@ -204,7 +204,7 @@ def test_wrong_folders(desk, tmp_path):
             plain.load(path)
     for file in (desk / "depth").iterdir():
         file.unlink()
-    with pytest.raises(DataError, match="depth: expected png or jpg images, got an empty folder"):
+    with pytest.raises(DataError, match="depth: expected images, got an empty folder"):
         plain.load(desk)
     with pytest.raises(ValueError, match="depth_per_metre"):
         plain.load(desk, depth_per_metre=0.0)

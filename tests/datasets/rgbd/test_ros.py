@@ -197,11 +197,23 @@ def test_a_rational_lens_that_the_camera_has_is_kept_and_another_is_undone(tmp_p
     assert (round(u), round(v)) != (28, 20)
 
 
+@pytest.mark.parametrize("D", [(0.1, -0.02, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)])
+def test_a_fisheye_is_undone_even_if_it_states_no_coefficients(tmp_path, walk, D):
+    make = Maker("mcap")
+    recording = ros.load(make.write(tmp_path, with_info(make, walk, model="equidistant", D=D)))
+    assert recording.camera.distortion == () and any("is undone" in note for note in recording.notes)
+    x, y = (28 - K[2]) / K[0], (20 - K[3]) / K[1]
+    angle = np.arctan(np.hypot(x, y))
+    bent = angle * (1 + D[0] * angle**2 + D[1] * angle**4) / np.hypot(x, y)
+    u, v = round(K[0] * x * bent + K[2]), round(K[1] * y * bent + K[3])
+    assert recording.read(1).depth[20, 28] == np.float32(walk.counts[1][v, u] / 1000)
+
+
 def test_a_lens_without_a_model_is_refused(tmp_path, walk):
     make = Maker("mcap")
-    path = make.write(tmp_path, with_info(make, walk, model="equidistant", D=(0.1, 0, 0, 0)))
+    path = make.write(tmp_path, with_info(make, walk, model="omnidirectional", D=(0.1, 0, 0, 0)))
     with pytest.raises(
-        DataError, match="camera_info: expected a distortion_model of plumb_bob, .*'equidistant'"
+        DataError, match="camera_info: expected a distortion_model of plumb_bob, .*'omnidirectional'"
     ):
         ros.load(path)
 

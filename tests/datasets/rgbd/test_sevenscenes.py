@@ -205,7 +205,7 @@ POSE = "seq-01/frame-000002.pose.txt"
         ),
         (
             write("seq-01/frame-000004.color.png", "no image"),
-            "4.color.png: expected an image, got cannot identify",
+            "4.color.png: expected an image, got bytes of no kind",
         ),
         (write("seq-01/frame-000000.depth.png", ""), "0.depth.png: expected an image, got "),
         (write("camera-intrinsics.txt", "585 585 320 240\n"), "intrinsics.txt:1: expected 3 numbers, got 4"),

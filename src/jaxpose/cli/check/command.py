@@ -98,20 +98,31 @@ def run(config: Config, on_update: OnUpdate = silent) -> Result | Formats:
 def _of_data(path: Path, config: Config) -> tuple[str, Checked]:
     """The format of the data, in words, and what is found in them."""
     if path.is_file() and path.suffix not in (".json", ".npz", ".h5", ".hdf5") and not _is_recording(path):
-        from jaxpose.cli.check.trajectory import check_trajectory
-
-        try:
-            form, checked = check_trajectory(path, config.columns)
-        except DataError:
-            from jaxpose.cli.check.inertial import check_alone
-
-            if (alone := check_alone(path)) is None:
-                raise
-            return "IMU readings", alone
-        return f"{form} trajectory", checked
+        return _file(path, config.columns)
     if not path.exists():
         raise DataError(f"{path}: expected {_KNOWN}, got nothing")
     return _folder(path, config.topics)
+
+
+def _file(path: Path, columns: str | None) -> tuple[str, Checked]:
+    """A file of poses, or of an IMU's readings."""
+    from jaxpose.cli.check.inertial import check_alone
+    from jaxpose.cli.check.trajectory import check_trajectory
+    from jaxpose.datasets.rgbd.imu_csv import names_readings, read_imu
+
+    error, form, checked = None, "unreadable", Checked()
+    try:
+        form, checked = check_trajectory(path, columns)
+    except DataError as told:
+        error = told
+    if form == "unreadable":
+        if (alone := check_alone(path)) is not None:
+            return "IMU readings", alone
+        if names_readings(path):
+            read_imu(path)  # whose error says what is wrong with readings
+        if error is not None:
+            raise error
+    return f"{form} trajectory", checked
 
 
 def main(args: Sequence[str] | None = None, prog: str = "jaxpose check") -> None:

@@ -7,6 +7,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
+from jaxpose.datasets.events.columns import named, order_of
 from jaxpose.datasets.events.sidecar import Source, load_beside, with_camera
 from jaxpose.datasets.events.stream import BLOCK, Block, Stream, Unit
 from jaxpose.datasets.images import only, some
@@ -16,18 +17,10 @@ from jaxpose.events import Mosaic
 from jaxpose.files.untrusted import hdf5_column, hdf5_whole_number, opened_hdf5
 
 _SUFFIXES = (".h5", ".hdf5")
-# What groups call the time, column, row and polarity of events, and the groups and tables that have them: of
-# DSEC and others, v2e, MVSEC, Metavision, M3ED; of two cameras the left one.
-_NAMES = (
-    ("t", "x", "y", "p"),
-    ("ts", "xs", "ys", "ps"),
-    ("timestamps", "x", "y", "polarities"),
-    ("timestamp", "x", "y", "polarity"),
-    ("time", "x", "y", "polarity"),
-)
+# The groups and tables that have events: of DSEC and others, v2e, MVSEC, Metavision, M3ED; of two cameras the
+# left one.
 _GROUPS = ("events/", "", "CD/events/", "prophesee/left/", "davis/left/events/")
 _TABLES = ("events", "CD/events", "davis/left/events", "data")
-_ORDERS = ([0, 1, 2, 3], [2, 0, 1, 3], [3, 0, 1, 2])
 _ECF = 0x8ECF
 _FOLDERS = (".", "events/left", "left")  # in DSEC each camera has its own
 _OTHERS = ("rectify_map.h5",)  # of DSEC, with no events in it
@@ -126,17 +119,18 @@ def _blocks(file: Path) -> Iterator[Block]:
 def _columns(file: Path, content: Any) -> tuple[_Read, int] | None:
     """Events as four rows of numbers in one group."""
     for place in _GROUPS:
-        for names in _NAMES:
-            columns = [hdf5_column(content, f"{place}{name}") for name in names]
-            if any(column is None for column in columns):
-                continue
-            lengths = {len(column) for column in columns}
-            if len(lengths) != 1:
-                got = ", ".join(f"{len(c)} {name}" for name, c in zip(names, columns, strict=True))
-                raise DataError(f"{file}: expected {place} with columns of one length, got {got}")
-            for column in columns:
-                _check_filters(column)
-            return lambda start, stop, c=columns: [column[start:stop] for column in c], lengths.pop()
+        group = content.get(place.rstrip("/")) if place else content
+        names = named(group) if hasattr(group, "keys") else None
+        columns = [hdf5_column(content, f"{place}{name}") for name in names or ()]
+        if names is None or any(column is None for column in columns):
+            continue
+        lengths = {len(column) for column in columns}
+        if len(lengths) != 1:
+            got = ", ".join(f"{len(c)} {name}" for name, c in zip(names, columns, strict=True))
+            raise DataError(f"{file}: expected {place} with columns of one length, got {got}")
+        for column in columns:
+            _check_filters(column)
+        return lambda start, stop, c=columns: [column[start:stop] for column in c], lengths.pop()
     return None
 
 
@@ -148,11 +142,10 @@ def _table(content: Any) -> tuple[_Read, int] | None:
             continue
         _check_filters(table)
         if table.dtype.names is None:
-            order = _order(place, np.asarray(table[:BLOCK], np.float64))
+            order = order_of(place, np.asarray(table[:BLOCK], np.float64))
             return partial(_by_order, table, order), len(table)
-        for names in _NAMES:
-            if set(names) <= set(table.dtype.names):
-                return partial(_by_name, table, names), len(table)
+        if (names := named(table.dtype.names)) is not None:
+            return partial(_by_name, table, names), len(table)
     return None
 
 
@@ -163,16 +156,6 @@ def _by_order(table: Any, order: list[int], start: int, stop: int) -> list[np.nd
 def _by_name(table: Any, names: tuple[str, ...], start: int, stop: int) -> list[np.ndarray]:
     rows = table[start:stop]
     return [rows[name] for name in names]
-
-
-def _order(place: str, rows: np.ndarray) -> list[int]:
-    """Columns of t, x, y and p in a table without names: the time rises, polarities are two."""
-    rises = (np.diff(rows, axis=0) >= 0).all(0) & (np.ptp(rows, axis=0) > 0)
-    fits = [order for order in _ORDERS if rises[order[0]] and (np.abs(rows[:, order[3]]) <= 1).all()]
-    if len(fits) != 1:
-        got = "several of them" if fits else "none of them"
-        raise ValueError(f"a table {place} whose columns are t x y p, x y t p or x y p t by {got}")
-    return fits[0]
 
 
 def _check_filters(column: Any) -> None:

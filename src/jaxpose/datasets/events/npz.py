@@ -1,4 +1,4 @@
-"""Events in a numpy archive: arrays x, y, t and p, with optional `poses.txt` and `calib.txt` beside it."""
+"""Events in numpy's files: arrays x, y, t and p, or one of four columns; `poses.txt`, `calib.txt` beside."""
 
 import zipfile
 from collections.abc import Iterator
@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxpose.datasets.events.columns import named, order_of
 from jaxpose.datasets.events.sidecar import Source, load_beside, with_camera
 from jaxpose.datasets.events.stream import BLOCK, Block, Stream, Unit
 from jaxpose.datasets.images import only, some
@@ -15,8 +16,6 @@ from jaxpose.datasets.types import EventRecording
 from jaxpose.errors import DataError
 from jaxpose.events import Mosaic
 from jaxpose.files.untrusted import array_header, reading
-
-_NAMES = (("t", "x", "y", "p"), ("ts", "xs", "ys", "ps"))
 
 
 def detect(path: Path) -> bool:
@@ -39,7 +38,7 @@ def load(
     unit: Unit | None = None,
     span: tuple[float, float] | None = None,
 ) -> EventRecording:
-    """Read events in a numpy archive, of arrays x, y, t, p (or xs, ys, ts, ps).
+    """Read events in a numpy archive, of arrays x, y, t, p (`columns.NAMES`), or in one array (n, 4).
 
     Time 0 is the first event's timestamp. In the same folder may lie `poses.txt`, T_world_cam in TUM's format
     on the clock of the events, and the camera (`sidecar.with_camera`).
@@ -103,18 +102,41 @@ def _names(file: Path) -> tuple[str, ...] | None:
             members = {name.removesuffix(".npy") for name in archive.namelist()}
     except Exception:  # zipfile raises many kinds on damaged files
         return None
-    return next((names for names in _NAMES if members.issuperset(names)), None)
+    return named(members)
+
+
+def _table(file: Path, stream: Any) -> Iterator[Block]:
+    """The events of one array (n, 4), row by row."""
+    shape, by_column, kind = array_header(stream)
+    if len(shape) != 2 or shape[1] != 4:
+        raise DataError(f"{file}: expected arrays x y t p, or one of 4 columns, got {kind} of shape {shape}")
+    if by_column:
+        whole = _rows(stream, kind, 4 * shape[0]).reshape(4, -1).T
+        yield Block(*whole.T[order_of(file.name, whole[:BLOCK].astype(np.float64))])
+        return
+    order = None
+    for start in range(0, shape[0], BLOCK):
+        rows = _rows(stream, kind, 4 * min(BLOCK, shape[0] - start)).reshape(-1, 4)
+        order = order or order_of(file.name, rows.astype(np.float64))
+        yield Block(*rows.T[order])
 
 
 def _blocks(file: Path) -> Iterator[Block]:
+    if file.suffix.lower() == ".npy":
+        with reading(file, "a whole array"), file.open("rb") as stream:
+            yield from _table(file, stream)
+        return
     with reading(file, "a whole npz file"):
         with ExitStack() as stack:
             archive = stack.enter_context(zipfile.ZipFile(file))
             members = {name.removesuffix(".npy") for name in archive.namelist()}
-            names = next((names for names in _NAMES if members.issuperset(names)), None)
+            names = named(members)
+            if names is None and len(members) == 1:
+                yield from _table(file, stack.enter_context(archive.open(archive.namelist()[0])))
+                return
             if names is None:
                 got = some(sorted(members)) or "none"
-                raise DataError(f"{file}: expected arrays x y t p (or xs ys ts ps), got {got}")
+                raise DataError(f"{file}: expected arrays x y t p, got {got}")
             columns: list[Any] = [stack.enter_context(archive.open(f"{name}.npy")) for name in names]
             kinds, lengths = zip(
                 *(_header(file, *pair) for pair in zip(names, columns, strict=True)), strict=True
@@ -131,7 +153,7 @@ def _blocks(file: Path) -> Iterator[Block]:
                     raise ValueError("an array that is longer than it says")
 
 
-def _header(file: Path, name: str, column: zipfile.ZipExtFile) -> tuple[np.dtype, int]:
+def _header(file: Path, name: str, column: Any) -> tuple[np.dtype, int]:
     """Kind of number and length of an array."""
     shape, _, kind = array_header(column)
     if len(shape) != 1:
@@ -139,7 +161,7 @@ def _header(file: Path, name: str, column: zipfile.ZipExtFile) -> tuple[np.dtype
     return kind, shape[0]
 
 
-def _rows(column: zipfile.ZipExtFile, kind: np.dtype, rows: int) -> np.ndarray:
+def _rows(column: Any, kind: np.dtype, rows: int) -> np.ndarray:
     content = column.read(rows * kind.itemsize)
     if len(content) < rows * kind.itemsize:
         raise EOFError("an array that ends early")

@@ -26,19 +26,23 @@ def raw_stream(file: Path) -> Stream:
         header = _header(file, stream)
         decoder = _decoder(file, header, stream)
     dropped: list[_Decoder] = []
+    cut: list[int] = []  # bytes of a last word that is not whole
 
     def blocks() -> Iterator[Block]:
         current = decoder()
-        dropped[:] = [current]
+        dropped[:], cut[:] = [current], []
         with file.open("rb") as stream:
             _header(file, stream)
             while data := stream.read(_BYTES):
-                words = len(data) // current.kind.itemsize  # a last word may be cut off
+                words, rest = divmod(len(data), current.kind.itemsize)
+                cut.extend([rest] if rest else [])
                 yield current.decode(np.frombuffer(data, current.kind, words))
 
     def notes() -> tuple[str, ...]:
         count = sum(current.dropped for current in dropped)
-        return (f"{count} events left out, before the first time or row of the file",) if count else ()
+        told = [f"{count} events left out, before the first time or row of the file"] if count else []
+        told += [f"the file ends within an event: its last {rest} bytes are left out" for rest in cut]
+        return tuple(told)
 
     return Stream(
         file, blocks, lambda row: f"{file}: event {row}", "us", _size(file, header), notes, unit_is_sure=True

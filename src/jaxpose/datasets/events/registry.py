@@ -60,7 +60,7 @@ LAYOUTS: dict[Format, Layout] = {
         event_hdf5,
         "mono",
     ),
-    "npz": Layout("npz", "numpy", "an npz file with x y t p", (".npz",), event_npz, "mono"),
+    "npz": Layout("npz", "numpy", "an npz file with x y t p, npy", (".npz", ".npy"), event_npz, "mono"),
     "file": Layout(
         "Prophesee RAW (EVT 2, 2.1, 3), DAT, AEDAT 4 (extra `events`), Event Stream, csv",
         "made bytes by the vendors' documents, dv-processing",

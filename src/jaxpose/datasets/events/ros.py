@@ -131,7 +131,7 @@ def find(path: Path | str, *, size: tuple[int, int] | None = None) -> Source:
             )
             lens = lens_of(bag, info, image)
             if len(lens.coefficients):
-                raise DataError(f"{bag.path}: {info}: expected a lens of plumb_bob, got one with k4 to k6")
+                raise DataError(f"{bag.path}: {info}: expected a lens of plumb_bob, got another")
             return Source(stream, lens.camera, (*notes, *lens.notes))
     beside = with_camera(stream, size)
     return beside._replace(notes=(*notes, *beside.notes))

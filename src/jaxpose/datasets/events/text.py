@@ -2,12 +2,13 @@
 
 import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple, NoReturn
 
 import numpy as np
 
+from jaxpose.datasets.events.columns import NAMES
 from jaxpose.datasets.events.stream import BLOCK, Block, Stream, Unit, stated_size
 from jaxpose.errors import DataError
 
@@ -15,13 +16,7 @@ _COLUMNS = "4 numbers (t x y p)"
 _EXACT_DIGITS = 15  # of a whole number in float64
 _LOOKED_AT = 50  # lines at the top
 _LONGEST = 4000  # characters of them
-# The names that headers give the four, by their first letters.
-_NAMES = {
-    "t": ("t", "ts", "time", "timestamp", "timestamps"),
-    "x": ("x", "xs", "col", "column"),
-    "y": ("y", "ys", "row"),
-    "p": ("p", "ps", "pol", "polarity", "on", "is_increase"),
-}
+_POLARITIES = {"true": 1.0, "on": 1.0, "false": 0.0, "off": 0.0}
 _UNITS: dict[str, Unit] = {"us": "us", "µs": "us", "microseconds": "us", "ns": "ns", "s": "s", "seconds": "s"}
 
 
@@ -69,7 +64,7 @@ def holds_events(file: Path) -> bool:
         first = next((row for row in rows if row), [])
     if len(first) != 4 or not _numbers(first):
         return False
-    x, y, p = (float(first[k]) for k in form.order[1:])
+    x, y, p = (float(_number(first[k]) or 0) for k in form.order[1:])
     return x == round(x) and y == round(y) and p in (-1, 0, 1)
 
 
@@ -83,9 +78,11 @@ def _form(file: Path) -> _Form:
                 size = stated_size(file, found[1], found[2])
             mark = _separator(text)
             words = _split(text.lstrip("#% "), mark)
-            if not comment and _numbers(words):
+            if not comment and len(words) > 2 and _numbers(words):
                 rows.append(words)
                 separator = mark if len(rows) == 1 else separator
+            elif len(words) == 2 and not rows and all(word.isdecimal() for word in words):
+                size, above = stated_size(file, *words), number + 1
             elif words and not rows and (named := _header(words)):
                 header, unit, above = named, _unit(words), number + 1
             elif comment and not rows:
@@ -99,7 +96,7 @@ def _form(file: Path) -> _Form:
 def _order(rows: list[list[str]]) -> tuple[int, int, int, int]:
     """Columns of lines without a header."""
     usable = [row for row in rows if len(row) == 4 and _numbers(row)]
-    values = np.array([[float(word) for word in row] for row in usable]).reshape(-1, 4)
+    values = np.array([[_number(word) for word in row] for row in usable], float).reshape(-1, 4)
     if len(values) < 2:
         return (0, 1, 2, 3)
     rises = (np.diff(values, axis=0) >= 0).all(0) & (np.ptp(values, axis=0) > 0)
@@ -110,7 +107,7 @@ def _order(rows: list[list[str]]) -> tuple[int, int, int, int]:
 def _header(words: list[str]) -> tuple[int, int, int, int] | None:
     """Columns of the four by the names in a header; None where it does not name them all."""
     plain = [re.sub(r"\W*\(.*|\W*\[.*|_(us|ns|s)$", "", word.strip().strip('"').lower()) for word in words]
-    found = [next((k for k, word in enumerate(plain) if word in names), None) for names in _NAMES.values()]
+    found = [next((k for k, word in enumerate(plain) if word in names), None) for names in NAMES.values()]
     return None if None in found else tuple(found)  # pyright: ignore[reportReturnType]
 
 
@@ -132,16 +129,20 @@ def _split(line: str, separator: str | None) -> list[str]:
 
 
 def _numbers(words: list[str]) -> bool:
+    return bool(words) and all(_number(word) is not None for word in words)
+
+
+def _number(word: str) -> float | None:
+    """A number, and a polarity in words."""
     try:
-        [float(word) for word in words]
+        return float(word)
     except ValueError:
-        return False
-    return bool(words)
+        return _POLARITIES.get(word.strip().lower())
 
 
 def _blocks(file: Path, form: _Form) -> Iterator[Block]:
     with file.open(encoding="utf-8-sig", errors="replace") as lines:
-        kind = _kind(file, form)
+        kind, polarity = _kind(file, form), _polarity(file, form)
         for _ in range(form.above):
             next(lines, None)
         while True:
@@ -155,6 +156,7 @@ def _blocks(file: Path, form: _Form) -> Iterator[Block]:
                         max_rows=BLOCK,
                         ndmin=1,
                         usecols=None if form.alone else form.order,
+                        converters=polarity,
                     )
             except ValueError as error:
                 _name_line(file, form, error)
@@ -173,6 +175,17 @@ def _kind(file: Path, form: _Form) -> np.dtype:
     if form.alone:  # loadtxt takes fields in the order of the columns
         names = [names[form.order.index(k)] for k in range(4)]
     return np.dtype([(name, np.int64 if whole and name == "t" else np.float64) for name in names])
+
+
+def _polarity(file: Path, form: _Form) -> dict[int | str, Callable[[str], float]] | None:
+    """How polarities in words are read; None where they are numbers, which numpy reads sooner by itself."""
+    with file.open(encoding="utf-8-sig", errors="replace") as lines:
+        rows = (_split(line, form.separator) for k, line in enumerate(lines) if k >= form.above)
+        first = next((row for row in rows if len(row) > form.order[3]), ["0"] * 16)
+    column = form.order[3]
+    if first[column].strip().lower() not in _POLARITIES:
+        return None
+    return {column: lambda word: _POLARITIES[word.strip().lower()]}
 
 
 def _line_of(file: Path, form: _Form, row: int) -> int:

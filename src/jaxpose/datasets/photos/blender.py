@@ -166,11 +166,17 @@ def _read(file: Path) -> _Source:
     if not found:
         raise DataError(f"{file}: expected images beside it, got none of the {len(frames)} it lists")
     missing = len(frames) - len(found)
+    first: dict[Path, dict[str, Any]] = {}
+    for frame, image in found:
+        first.setdefault(image, frame)
+    repeated, found = len(found) - len(first), [(frame, image) for image, frame in first.items()]
     frames = [frame for frame, _ in found]
     t, stamped, note = _times(file, frames)
     order = np.argsort(t)
     frames, images = [frames[i] for i in order], [found[i][1] for i in order]
     skipped = (f"{file.name}: {missing} frames without an image skipped",) if missing else ()
+    if repeated:
+        skipped += (f"{file.name}: {repeated} frames left out, of an image that is listed before",)
     common = {key: value for key, value in content.items() if key != "frames"}
     entries = [{**common, **frame} for frame in frames]
     lenses = _lenses(file, entries, images)

@@ -7,12 +7,10 @@ from pathlib import Path, PurePosixPath
 
 from jaxpose.datasets.images import SUFFIXES, may_exist, natural_order
 
-IMAGE_SUFFIXES = (*SUFFIXES, ".webp", ".bmp", ".tif", ".tiff")
-
 
 def images_in(folder: Path) -> list[Path]:
     """The image files of a folder and of those in it, in natural order of their names; no `._*` of macOS."""
-    found = [path for path in _files(folder) if path.suffix.lower() in IMAGE_SUFFIXES]
+    found = [path for path in _files(folder) if path.suffix.lower() in SUFFIXES]
     return sorted(found, key=lambda path: natural_order(path.relative_to(folder).as_posix()))
 
 
@@ -28,7 +26,7 @@ def finder(folder: Path) -> Callable[[str], Path | None]:
     def look_up(name: str) -> Path | None:
         if not listing:
             for path in _files(folder):
-                if path.suffix.lower() in IMAGE_SUFFIXES:
+                if path.suffix.lower() in SUFFIXES:
                     relative = path.relative_to(folder).as_posix().casefold()
                     for key in (relative, relative[: -len(path.suffix)]):
                         listing.setdefault(key, []).append(path)

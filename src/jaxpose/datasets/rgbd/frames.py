@@ -1,6 +1,7 @@
 """What formats of image files share: partners found by listing, and frames of files as a recording."""
 
 import os
+import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -53,6 +54,13 @@ class Poses(NamedTuple):
 def visible(folder: Path) -> list[Path]:
     """The files of a folder in order, without hidden ones (macOS adds a `._x` to each x)."""
     return sorted(file for file in folder.iterdir() if not file.name.startswith("."))
+
+
+def subfolder(folder: Path, names: Sequence[str]) -> Path | None:
+    """The first of some folders that is there, in upper or lower case; None where none is."""
+    inner = visible(folder) if folder.is_dir() else []
+    there = {path.name.lower(): path for path in inner if path.is_dir()}
+    return next((there[name] for name in names if name in there), None)
 
 
 def numbered(folder: Path, suffixes: Sequence[str] = SUFFIXES) -> dict[int, Path]:
@@ -136,6 +144,16 @@ class Listing:
         return self._names[folder]
 
 
+def _listed_file(where: Path | str, listing: Listing, name: str) -> Path | None:
+    """The file of a name in a list; of one that was absolute on another machine by the last parts of it."""
+    parts = re.split(r"[/\\]", name)
+    if parts[0] and not re.fullmatch(r"[A-Za-z]:", parts[0]):
+        return listing.find(name_inside(where, name))
+    tails = ("/".join(parts[k:]) for k in range(1, len(parts)))
+    files = (listing.find(name_inside(where, tail)) for tail in tails)
+    return next((file for file in files if file is not None), None)
+
+
 def listed(
     where: Path | str, root: Path, names: Sequence[str]
 ) -> tuple[list[int], list[Path], tuple[str, ...]]:
@@ -155,7 +173,7 @@ def listed(
     listing = Listing(root)
     files = {}
     for i, name in enumerate(names):
-        if (file := listing.find(name_inside(where, name))) is not None:
+        if (file := _listed_file(where, listing, name)) is not None:
             files[i] = file
     lacking = [name for i, name in enumerate(names) if i not in files]
     if not files:

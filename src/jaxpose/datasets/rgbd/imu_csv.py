@@ -9,10 +9,11 @@ from jaxtyping import Float
 from jaxpose.datasets.rgbd.euroc_files import read_extrinsics
 from jaxpose.datasets.types import Recording
 from jaxpose.errors import DataError
-from jaxpose.files.columns import POSE, Named, joined_clock, named_columns
+from jaxpose.files.columns import POSE, Named, joined_clock, named_columns, named_parts
 from jaxpose.files.kalibr import CameraImu, is_camchain, read_camchain
 from jaxpose.files.matrices import orthonormal
 from jaxpose.files.tables import (
+    Table,
     left_out_notes,
     numbered_lines,
     read_all_numbers,
@@ -80,6 +81,9 @@ def read_imu(file: Path | str) -> ImuFile:
     if not table.lines:
         raise DataError(f"{file}: expected lines of {_COLUMNS}, got none")
     named, width = named_columns(table, _NAMES), len(table.words(0))
+    if named is None and (lacking := _lacking(table)):
+        wanted = f"a header that names {' '.join(_ORDER)}"
+        raise DataError(f"{file}: expected {wanted}, got one without {' '.join(lacking)}")
     if named is None and width != 7:
         raise DataError(
             f"{file}:{table.lines[0]}: expected {_COLUMNS}, or a header that names them, got {width} columns"
@@ -100,6 +104,27 @@ def read_imu(file: Path | str) -> ImuFile:
     return ImuFile(
         rows.ns, rate * rows.values[:, :3], force * rows.values[:, 3:], notes + brought, rows.unit, gaps
     )
+
+
+def names_readings(file: Path) -> bool:
+    """Whether the header of a table names some quantities of an IMU, though it may lack others.
+
+    Args:
+        file: A table.
+
+    Returns:
+        Whether an error of `read_imu` says more of it than that of a reader of poses.
+    """
+    return bool(_lacking(joined_clock(read_table(file))))
+
+
+def _lacking(table: Table) -> list[str]:
+    """What the first header that names three quantities of an IMU has no name for; nothing without one."""
+    for header in table.headers:
+        there = named_parts(header, table, _NAMES)
+        if len(there) >= 3:
+            return [name for name in _ORDER if name not in there]
+    return []
 
 
 def _to_si(file: Path, named: Named | None) -> tuple[tuple[float, float], tuple[str, ...]]:

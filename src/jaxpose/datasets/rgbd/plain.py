@@ -12,7 +12,7 @@ from jaxpose.datasets.images import (
     natural_order,
     some,
 )
-from jaxpose.datasets.rgbd.frames import Poses, of_files, visible
+from jaxpose.datasets.rgbd.frames import Poses, of_files, subfolder, visible
 from jaxpose.datasets.rgbd.plain_files import LOGS, check_count, read_camera, read_poses
 from jaxpose.datasets.types import Recording
 from jaxpose.errors import DataError
@@ -31,7 +31,7 @@ def detect(path: Path) -> bool:
     Returns:
         Whether `load` should read it.
     """
-    return (path / "depth").is_dir() and any((path / name).is_dir() for name in _COLORS)
+    return all(subfolder(path, names) is not None for names in (("depth",), _COLORS))
 
 
 def has_timestamps(path: Path) -> bool:
@@ -111,12 +111,12 @@ def load(path: Path | str, *, rate_hz: float = 30.0, depth_per_metre: float | No
 
 def _images(folder: Path, names: Sequence[str]) -> list[Path]:
     """Image files of the first of some folders that is there, r_2 before r_10."""
-    inner = next((folder / name for name in names if (folder / name).is_dir()), None)
+    inner = subfolder(folder, names)
     if inner is None:
         raise DataError(f"{folder}: expected folders color/ and depth/, got {found(folder)}")
     files = [file for file in visible(inner) if file.suffix.lower() in SUFFIXES]
     if not files:
-        raise DataError(f"{inner}: expected png or jpg images, got {found(inner)}")
+        raise DataError(f"{inner}: expected images, got {found(inner)}")
     return sorted(files, key=lambda file: natural_order(file.name))
 
 

@@ -38,11 +38,13 @@ def read_camera(folder: Path, size: tuple[int, int]) -> tuple[Camera, float | No
 
 
 def _read_json(file: Path, size: tuple[int, int]) -> tuple[Camera, float | None]:
-    """Our own `fx fy cx cy`, with OpenCV's `distortion`, or Open3D's `intrinsic_matrix`, column by column."""
+    """Our own `fx fy cx cy`, with OpenCV's `distortion`, or rows of `K`, or Open3D's columns of it."""
     content = read_json(file, "intrinsics")
     number = lambda key: float(numbers(file, content, key))
     if "intrinsic_matrix" in content:
         K = numbers(file, content, "intrinsic_matrix", (9,)).reshape(3, 3).T
+    elif "K" in content:
+        K = np.reshape(numbers(file, {"K": np.ravel(content["K"]).tolist()}, "K", (9,)), (3, 3))
     else:
         fx, fy, cx, cy = (number(key) for key in ("fx", "fy", "cx", "cy"))
         K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])

@@ -1,4 +1,4 @@
-"""Lenses of OpenCV's rational model with k4 to k6, which `Camera` does not have: undone in images or rays."""
+"""Lenses that `Camera` does not have, OpenCV's rational model with k4 to k6 and its fisheye, undone."""
 
 from typing import NamedTuple
 
@@ -19,12 +19,13 @@ class Maps(NamedTuple):
     row: np.ndarray
 
 
-def undistortion(camera: Camera, coefficients: Float[np.ndarray, " k"]) -> Maps:
+def undistortion(camera: Camera, coefficients: Float[np.ndarray, " k"], *, fisheye: bool = False) -> Maps:
     """How images of a lens become those of a pinhole.
 
     Args:
         camera: The pinhole.
         coefficients: k1 k2 p1 p2 k3 k4 k5 k6 of the lens, which has the same intrinsics otherwise.
+        fisheye: Whether they are k1 k2 k3 k4 of a fisheye (equidistant, Kannala and Brandt).
 
     Returns:
         For `remapped`.
@@ -32,7 +33,8 @@ def undistortion(camera: Camera, coefficients: Float[np.ndarray, " k"]) -> Maps:
     import cv2
 
     K, size = _matrix(camera), (camera.width, camera.height)
-    return Maps(*cv2.initUndistortRectifyMap(K, coefficients, np.eye(3), K, size, cv2.CV_32FC1))
+    module = cv2.fisheye if fisheye else cv2
+    return Maps(*module.initUndistortRectifyMap(K, coefficients, np.eye(3), K, size, cv2.CV_32FC1))
 
 
 def remapped(image: np.ndarray, maps: Maps) -> np.ndarray:
@@ -51,12 +53,15 @@ def remapped(image: np.ndarray, maps: Maps) -> np.ndarray:
     return np.asarray(cv2.remap(image, maps.column, maps.row, how))
 
 
-def pixel_rays(camera: Camera, coefficients: Float[np.ndarray, " k"]) -> Float[np.ndarray, "h w 3"]:
+def pixel_rays(
+    camera: Camera, coefficients: Float[np.ndarray, " k"], *, fisheye: bool = False
+) -> Float[np.ndarray, "h w 3"]:
     """Rays of the pixels of a lens.
 
     Args:
         camera: Its intrinsics.
         coefficients: As for `undistortion`.
+        fisheye: Likewise.
 
     Returns:
         Rays with z = 1; NaN where no ray leads to a pixel, beyond the lens' own circle.
@@ -69,7 +74,9 @@ def pixel_rays(camera: Camera, coefficients: Float[np.ndarray, " k"]) -> Float[n
     with np.errstate(all="ignore"):
         for _ in range(_ITERATIONS):  # OpenCV's undistortPoints stops after 5 in some of its versions
             rays[:, :2] += off
-            again = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), _matrix(camera), coefficients)[0]
+            module = cv2.fisheye if fisheye else cv2
+            at = rays[:, None], np.zeros(3), np.zeros(3), _matrix(camera), coefficients
+            again = module.projectPoints(*at)[0]
             off = (pixels - again[:, 0]) / focal
             if not (np.abs(off) > _ENOUGH).any():
                 break

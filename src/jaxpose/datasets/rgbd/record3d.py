@@ -25,6 +25,7 @@ from jaxpose.geometry import rigid
 from jaxpose.geometry.camera import Camera, resized
 
 EXTRA = 'pip install -e ".[phone]"'
+_METADATA = re.compile(r"(.*/)?metadata")
 _ENTRY = re.compile(r"rgbd/(\d{1,18})\.(jpg|depth|conf)")
 _MOST_BYTES = 1 << 28  # of an entry
 
@@ -49,16 +50,20 @@ def detect(path: Path) -> bool:
     """
     if path.is_dir():
         return (path / "metadata").is_file() and (path / "rgbd").is_dir()
+    if path.suffix.lower() == ".zip" and zipfile.is_zipfile(path):
+        with reading(path, "a zip"), zipfile.ZipFile(path) as archive:
+            names = archive.namelist()
+        return any(_METADATA.fullmatch(name) for name in names) and any("rgbd/" in name for name in names)
     return path.suffix.lower() == ".r3d" and path.is_file()
 
 
 def load(path: Path | str) -> Recording:
     """Read a video of Record3D. Its depth, where compressed, needs the package lzfse (extra `phone`).
 
-    Nothing is unpacked to disk. Poses are ARKit's, quaternion xyzw and position, of a camera with OpenGL's
-    axes that is turned as the images are; its world's y points up. Intrinsics are the median of those of each
-    frame, where there are any, else K, column by column. Depth is in metres, 0 where the confidence is 0;
-    colour is resized to it. Times are `frameTimestamps`, else those of `fps`.
+    Nothing is unpacked to disk; a zip may hold its folder. Poses are ARKit's, quaternion xyzw and position,
+    of a camera with OpenGL's axes that is turned as the images are; its world's y points up. Intrinsics are
+    the median of those of each frame, where there are any, else K, column by column. Depth is in metres, 0
+    where the confidence is 0; colour is resized to it. Times are `frameTimestamps`, else those of `fps`.
 
     Args:
         path: The `.r3d`, or the folder of an unpacked one.
@@ -113,13 +118,15 @@ def _open(path: Path) -> _Source:
     with reading(path, "an archive of Record3D (a zip)"):
         archive = zipfile.ZipFile(path)
         names = archive.namelist()
+    top = next((name.removesuffix("metadata") for name in names if _METADATA.fullmatch(name)), "")
 
     def read(name: str) -> bytes:
         with reading(f"{path}: {name}", "an entry that can be read"):
-            if archive.getinfo(name).file_size > _MOST_BYTES:
-                raise ValueError(f"{archive.getinfo(name).file_size} bytes")
-            return archive.read(name)
+            if archive.getinfo(top + name).file_size > _MOST_BYTES:
+                raise ValueError(f"{archive.getinfo(top + name).file_size} bytes")
+            return archive.read(top + name)
 
+    names = [name.removeprefix(top) for name in names]
     return _Source(
         path, names, read, json_object(read("metadata"), f"{path}: metadata", "metadata of Record3D")
     )

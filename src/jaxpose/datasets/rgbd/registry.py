@@ -44,7 +44,6 @@ Format = Literal[
     "sun3d",
     "plain",
 ]
-_ARCHIVES = (".zip", ".tgz", ".gz", ".tar", ".7z", ".rar")
 _MOST_FOLDERS = 200  # looked into for recordings, where a path is none itself
 
 
@@ -195,7 +194,7 @@ def nearest(path: Path | str) -> str:
     """
     path = Path(path)
     if not path.is_dir():
-        return found(path) + (" to be unpacked first" if path.suffix in _ARCHIVES and path.is_file() else "")
+        return found(path)
     if inner := _recordings_in(path):
         return f"a folder of recordings, name one: {some(inner)}"
     ranked = []

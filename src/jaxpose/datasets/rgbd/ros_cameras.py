@@ -17,6 +17,7 @@ from jaxpose.geometry.camera import Camera, resized
 _SAME_SHAPE = 0.02  # of width by height, for images of the same view in two sizes
 _BROWN = ("plumb_bob", "radtan", "brown_conrady", "inverse_brown_conrady", "none", "")
 _RATIONAL = "rational_polynomial"
+_FISHEYE = ("equidistant", "fisheye", "kannala_brandt", "kannala_brandt4")
 
 
 class View(NamedTuple):
@@ -31,8 +32,9 @@ class TopicLens(NamedTuple):
     """The camera of a topic, and the lens that has to be undone in its images for it."""
 
     camera: Camera
-    coefficients: np.ndarray  # k1 k2 p1 p2 k3 k4 k5 k6 of what `Camera` has no model for, else none
+    coefficients: np.ndarray  # for `undistortion`, of what `Camera` has no model for, else none
     notes: tuple[str, ...]
+    fisheye: bool = False
 
 
 def common_view(bag: Bag, tree: Tree, color: ImageTopic, depth: ImageTopic) -> View:
@@ -61,11 +63,11 @@ def common_view(bag: Bag, tree: Tree, color: ImageTopic, depth: ImageTopic) -> V
     if (w, h) == (width, height):
         if not len(lens.coefficients):
             return View(lens.camera, Frame, lens.notes)
-        maps = undistortion(lens.camera, lens.coefficients)
+        maps = undistortion(lens.camera, lens.coefficients, fisheye=lens.fisheye)
         return View(lens.camera, lambda rgb, z: Frame(remapped(rgb, maps), remapped(z, maps)), lens.notes)
     if len(lens.coefficients):
         raise DataError(
-            f"{bag.path}: {info}: expected {_BROWN[0]} with depth of another size, got {_RATIONAL}"
+            f"{bag.path}: {info}: expected {_BROWN[0]} with depth of another size, got another lens"
         )
     note = f"colour resized from {width}x{height} to {w}x{h}, the size of depth"
     camera = resized(lens.camera, w, h)
@@ -83,12 +85,13 @@ def _registered(bag: Bag, tree: Tree, color: ImageTopic, depth: ImageTopic, lens
             f"{bag.path}: expected depth registered to colour, or what registers it, got {got}, no {lacking}"
         )
     of_depth = lens_of(bag, other, depth)
-    rays = pixel_rays(of_depth.camera, of_depth.coefficients) if len(of_depth.coefficients) else None
+    undone = lambda of, lens: of(lens.camera, lens.coefficients, fisheye=lens.fisheye)
+    rays = undone(pixel_rays, of_depth) if len(of_depth.coefficients) else None
     camera = lens.camera
     if width > 1.5 * w:  # else most pixels of colour would stay without depth
         camera = resized(camera, w, round(w * height / width))
     register = register_depth(of_depth.camera, camera, T_color_depth, rays=rays)
-    maps = undistortion(lens.camera, lens.coefficients) if len(lens.coefficients) else None
+    maps = undone(undistortion, lens) if len(lens.coefficients) else None
     color_of = lambda rgb: _resized(rgb if maps is None else remapped(rgb, maps), camera)
     note = f"depth of {depth.frame} ({w}x{h}) registered to {color.frame}"
     note += f", colour resized to {camera.width}x{camera.height}" if camera.width != width else ""
@@ -100,25 +103,28 @@ def lens_of(bag: Bag, topic: str, image: ImageTopic) -> TopicLens:
     info, (width, height) = bag.first(topic), image.kind.size
     K, D, P = (np.array(_either(info, name), np.float64) for name in "KDP")
     model, where = str(info.distortion_model), f"{bag.path}: {topic}"
+    fisheye = model.lower() in _FISHEYE
     if "rect" in image.topic.name.rsplit("/", 2)[-1] + image.topic.name.rsplit("/", 2)[-2]:
-        K, D = P.reshape(3, 4)[:, :3], np.zeros(0)
+        K, D, fisheye = P.reshape(3, 4)[:, :3], np.zeros(0), False
     K = K.reshape(3, 3)
     if not (np.isfinite(K).all() and K[0, 0] > 0 and K[1, 1] > 0 and np.isfinite(D).all()):
         raise DataError(f"{where}: expected positive focal lengths, got {K[0, 0]:g} and {K[1, 1]:g}")
-    if D.any() and model not in (*_BROWN, _RATIONAL):
-        known = ", ".join((_BROWN[0], _RATIONAL))
+    if D.any() and not fisheye and model not in (*_BROWN, _RATIONAL):
+        known = ", ".join((_BROWN[0], _RATIONAL, _FISHEYE[0]))
         raise DataError(f"{where}: expected a distortion_model of {known}, got {model!r}: rectify its images")
     size = (int(info.width) or width, int(info.height) or height)
-    lens = tuple(float(d) for d in (*D[:5], *[0.0] * 5)[:5]) if D.any() else ()
+    lens = tuple(float(d) for d in (*D[:5], *[0.0] * 5)[:5]) if D.any() and not fisheye else ()
     fx, fy, cx, cy = (float(x) for x in K[[0, 1, 0, 1], [0, 1, 2, 2]])
     camera = resized(Camera(fx, fy, cx, cy, size[0], size[1], lens), width, height)
     note = (
         (f"{topic} is of {size[0]}x{size[1]}, scaled to {width}x{height}",) if size != (width, height) else ()
     )
-    if not D[5:].any():
+    if not D[5:].any() and not fisheye:
         return TopicLens(camera, np.zeros(0), note)
     undone = f"{topic}: the lens of {model} is undone in the images, which are a pinhole's"
-    return TopicLens(camera._replace(distortion=()), D, (*note, undone))
+    if fisheye:
+        D = np.append(D, np.zeros(4))[:4]
+    return TopicLens(camera._replace(distortion=()), D, (*note, undone), fisheye)
 
 
 def _either(message: Any, name: str) -> Any:

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from jaxpose.datasets.images import check_intrinsics, found, name_of, read_depth
-from jaxpose.datasets.rgbd.frames import Images, Poses, assembled, numbered
+from jaxpose.datasets.rgbd.frames import Images, Listing, Poses, assembled, numbered
 from jaxpose.datasets.rgbd.phones import R_CAM_PHONE, UNSURE, Y_UP, middle, sure_by_file
 from jaxpose.datasets.types import Recording
 from jaxpose.datasets.video import Video
@@ -56,7 +56,7 @@ def load(path: Path | str) -> Recording:
     """
     folder = Path(path)
     ns, numbers, table, repeated = _odometry(folder / "odometry.csv")
-    depth, video = numbered(folder / "depth"), Video(folder / "rgb.mp4")
+    depth, video = numbered(folder / "depth"), Video(Listing(folder).find("rgb.mp4") or folder / "rgb.mp4")
     there = [i for i, n in enumerate(numbers) if n in depth and n - numbers[0] < len(video)]
     if not there:
         raise DataError(f"{folder}: expected {_LAYOUT}, got no depth of the frames of odometry.csv")
