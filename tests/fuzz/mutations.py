@@ -94,7 +94,7 @@ def tree(random: Random, content: bytes) -> bytes:
     for _ in range(random.choice((1, 1, 2, 4))):
         places: list[tuple[Any, Any]] = []
         queue = [value]
-        while queue:
+        while queue and len(places) < 10_000:
             node = queue.pop()
             keys = (
                 list(node) if isinstance(node, dict) else range(len(node)) if isinstance(node, list) else ()
