@@ -4,8 +4,6 @@ import re
 
 _LONGEST = 1000  # characters of a message
 _NO_LINE = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029]")  # what ends a line or does not show
-    "[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]"
-)  # what ends a line or is none of its letters
 
 
 class DataError(Exception):
