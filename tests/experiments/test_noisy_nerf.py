@@ -250,7 +250,7 @@ def test_what_a_run_leaves(tmp_path):
         trajectory_error.procrustes(poses, reference.T), np.asarray(anywhere, np.float64)
     )
     assert_allclose(numpy_evaluator.load(outcome.folder / "field.npz")(t), aligned, atol=3e-5)
-    camera, images, folder = read_camera(outcome.folder / "camera.json")
+    camera, images, folder, *_ = read_camera(outcome.folder / "camera.json")
     assert camera == problem.train.camera and images == problem.train.files and folder == outcome.folder
     density, _ = loaded.model.scene.query(loaded.state.scene, jnp.zeros(3), jnp.ones(3))
     assert np.isfinite(density) and float(loaded.state.scene["progress"]) == 1

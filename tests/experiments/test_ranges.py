@@ -31,6 +31,7 @@ POSITIONAL = {
     "eval": ["a.txt", "b.txt"],
     "export": ["run", "--format", "tum", "--out", "o.txt"],
     "view": ["run"],
+    "convert": ["data", "--to", "plain", "--out", "o"],
 }
 _COMMANDS: dict[str, Command] = {}
 

@@ -143,7 +143,7 @@ def test_a_camera_that_turns_in_place_is_not_called_wrong():
 
 
 def test_a_run_says_what_camera_it_had(finished):
-    camera, images, _ = read_camera(finished.folder / "camera.json")
+    camera, images, *_ = read_camera(finished.folder / "camera.json")
     assert (camera.width, camera.height, images) == (80, 60, ())
 
 
@@ -171,7 +171,7 @@ def test_rgbd_slam_on_a_folder(folder, tmp_path, capsys):
     assert dof["after_mean"] < dof["before_mean"] <= 6 and "in the intrinsic frame" in said.out
     assert results["ate_rmse_m"] < 0.02
     assert results["imu"] == {"mode": "none", "readings": "not used"}
-    camera, images, where = read_camera(out / "camera.json")
+    camera, images, where, *_ = read_camera(out / "camera.json")
     assert images == tuple(f"frame-{k:06d}.color.png" for k in range(FRAMES)) and (camera.width, where) == (
         80,
         folder,

@@ -63,7 +63,7 @@ def named_parts(header: str, table: Table, wanted: Mapping[str, str]) -> set[str
         Their names; none for a header of another number of columns.
     """
     names = _split(header, table.separator) if len(header) <= _LONGEST_HEADER else []
-    if len(names) != len(table.words(0)):
+    if not table.rows or len(names) != len(table.words(0)):
         return set()
     plain = [re.sub(r"^(t|time|timestamps?|stamp)_\w+$", r"\1", _plain(name)[0]) for name in names]
     return {quantity for quantity, form in wanted.items() if any(re.fullmatch(form, name) for name in plain)}
