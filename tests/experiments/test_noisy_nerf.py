@@ -185,7 +185,7 @@ def test_a_killed_run_resumed_has_the_numbers_of_a_whole_one(tmp_path, monkeypat
         pass
 
     def kill(update):
-        if update.phase == "training" and update.done == 400:
+        if update.phase == "training" and update.done == 200:
             raise Killed
 
     out = tmp_path / "cut"
