@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from jaxpose.datasets.images import INTRINSICS, image_size
 from jaxpose.datasets.rgbd.rational import remapped, undistortion
@@ -100,12 +101,7 @@ def _upright(recording: Recording) -> tuple[Recording, list[str]]:
     down = gravity / np.linalg.norm(gravity)
     if recording.T_world_cam is None or np.abs(down - [0, 0, -1]).max() < 1e-9:
         return recording, []
-    axis, cosine = np.cross(down, [0, 0, -1]), -float(down[2])
-    if np.linalg.norm(axis) < 1e-9:
-        turn = np.diag([1.0, -1, -1])
-    else:
-        cross = np.cross(np.eye(3), axis)
-        turn = np.eye(3) + cross + cross @ cross / (1 + cosine)
+    turn = Rotation.align_vectors([0.0, 0.0, -1.0], down)[0].as_matrix()  # the shortest way
     T = rigid.make(turn, np.zeros(3)) @ recording.T_world_cam
     note = "the world of the poses is turned so that z points up"
     return recording._replace(T_world_cam=T, gravity_world=np.array(GRAVITY_WORLD)), [note]

@@ -104,7 +104,7 @@ def _decoder(file: Path, header: str, stream: BinaryIO) -> type[_Decoder]:
     if version in decoders:
         return decoders[version]
     if version != "21":
-        got = stated[0][:40] if stated else "none"
+        got = stated[0] if stated else "none"
         raise DataError(f"{file}: expected a header with evt 2.0, 2.1 or 3.0, got {got}")
     endianness = re.search(r"endianness=(\w+)", header, re.I)
     if endianness:

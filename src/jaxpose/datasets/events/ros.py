@@ -17,7 +17,7 @@ from jaxpose.datasets.rgbd.ros_bag import Bag, Topic, bag_file, open_bag
 from jaxpose.datasets.rgbd.ros_cameras import lens_of
 from jaxpose.datasets.rgbd.ros_frames import frame_name, read_tree, stamp_ns
 from jaxpose.datasets.rgbd.ros_images import ImageKind
-from jaxpose.datasets.rgbd.ros_motion import Log, read_into
+from jaxpose.datasets.rgbd.ros_motion import Log, leading_poses, read_into
 from jaxpose.datasets.rgbd.ros_topics import POSES, ImageTopic
 from jaxpose.datasets.types import EventRecording
 from jaxpose.errors import DataError
@@ -221,15 +221,8 @@ def _poses(
     topics = [topic.name for topic in bag.topics.values() if topic.kind in POSES]
     for name, recorded_ns, message in bag.messages(*topics):
         logs[name] = read_into(logs.get(name), stamp_ns(message.header) or recorded_ns, message)
-    tree, notes = read_tree(bag), []
-    for name, (child, values) in logs.items():
-        T_child_cam = tree.static(child, frame) if child else np.eye(4)
-        stamps = [at for at in sorted(values) if np.isfinite(values[at]).all()]
-        if T_child_cam is None:
-            notes.append(f"{name} left out: no transform from {child} to {frame} in /tf_static")
-        elif stamps:
-            T = np.stack([values[at] for at in stamps]) @ T_child_cam
-            notes.append(f"ground truth: {name}, poses of {child or f'{frame}, as it does not say'}")
-            return since(stamps, zero_ns), T, tuple(notes)
+    found, notes = leading_poses(logs, read_tree(bag), frame, fewest=1)
+    if found is not None:
+        return since(found.ns, zero_ns), found.T_world_child @ found.T_child_cam, tuple(notes)
     notes.append("no poses that lead to the camera: there is no ground truth to compare with")
     return np.zeros(0), np.zeros((0, 4, 4)), tuple(notes)

@@ -59,9 +59,7 @@ def holds_events(file: Path) -> bool:
     form = _form(file)
     if form.named:
         return True
-    with file.open(encoding="utf-8-sig", errors="replace") as lines:
-        rows = (_split(line, form.separator) for k, line in enumerate(lines) if k >= form.above)
-        first = next((row for row in rows if row), [])
+    first = _first_row(file, form)
     if len(first) != 4 or not _numbers(first):
         return False
     x, y, p = (float(_number(first[k]) or 0) for k in form.order[1:])
@@ -167,9 +165,8 @@ def _blocks(file: Path, form: _Form) -> Iterator[Block]:
 
 def _kind(file: Path, form: _Form) -> np.dtype:
     """Float64 for all but timestamps of so many digits that only integers hold them, as ns since 1970 are."""
-    with file.open(encoding="utf-8-sig", errors="replace") as lines:
-        rows = (_split(line, form.separator) for k, line in enumerate(lines) if k >= form.above)
-        first = next((row for row in rows if len(row) > form.order[0]), ["0"] * 16)[form.order[0]].strip()
+    row = _first_row(file, form, form.order[0])
+    first = row[form.order[0]].strip() if row else "0"
     whole = first.isdecimal() and len(first) > _EXACT_DIGITS
     names = ["t", "x", "y", "p"]
     if form.alone:  # loadtxt takes fields in the order of the columns
@@ -179,13 +176,18 @@ def _kind(file: Path, form: _Form) -> np.dtype:
 
 def _polarity(file: Path, form: _Form) -> dict[int | str, Callable[[str], float]] | None:
     """How polarities in words are read; None where they are numbers, which numpy reads sooner by itself."""
-    with file.open(encoding="utf-8-sig", errors="replace") as lines:
-        rows = (_split(line, form.separator) for k, line in enumerate(lines) if k >= form.above)
-        first = next((row for row in rows if len(row) > form.order[3]), ["0"] * 16)
     column = form.order[3]
-    if first[column].strip().lower() not in _POLARITIES:
+    row = _first_row(file, form, column)
+    if not row or row[column].strip().lower() not in _POLARITIES:
         return None
     return {column: lambda word: _POLARITIES[word.strip().lower()]}
+
+
+def _first_row(file: Path, form: _Form, column: int = 0) -> list[str]:
+    """The words of the first event that has such a column; none where none has."""
+    with file.open(encoding="utf-8-sig", errors="replace") as lines:
+        rows = (_split(line, form.separator) for k, line in enumerate(lines) if k >= form.above)
+        return next((row for row in rows if len(row) > column), [])
 
 
 def _line_of(file: Path, form: _Form, row: int) -> int:

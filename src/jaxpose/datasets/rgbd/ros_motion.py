@@ -49,6 +49,42 @@ def read_into(log: Log | None, ns: int, message: Any) -> Log:
     return log
 
 
+class LeadingPoses(NamedTuple):
+    """Poses of a topic, of a frame of reference from which a camera's place is known."""
+
+    ns: list[int]  # (k,)
+    T_world_child: Float[np.ndarray, "k 4 4"]
+    T_child_cam: Float[np.ndarray, "4 4"]
+
+
+def leading_poses(
+    logs: dict[str, Log], tree: Tree, camera_frame: str, *, fewest: int
+) -> tuple[LeadingPoses | None, list[str]]:
+    """Find the first topic of poses that leads to a camera.
+
+    Args:
+        logs: Topics of poses.
+        tree: Frames of reference.
+        camera_frame: The camera's.
+        fewest: Poses that it has to have.
+
+    Returns:
+        The poses, or None; notes on what they are and what was left out.
+    """
+    notes = []
+    for topic, (child, values) in logs.items():
+        stamps = [at for at in sorted(values) if np.isfinite(values[at]).all()]
+        T_child_cam = tree.static(child, camera_frame) if child else np.eye(4)
+        if T_child_cam is None:
+            notes.append(f"{topic} left out: no transform from {child} to {camera_frame} in /tf_static")
+        elif len(stamps) >= fewest:
+            notes.append(f"ground truth: {topic}, poses of {child or f'{camera_frame}, as it does not say'}")
+            if lost := len(values) - len(stamps):
+                notes.append(f"{lost} of {len(values)} poses of {topic} left out, with NaN or no quaternion")
+            return LeadingPoses(stamps, np.stack([values[at] for at in stamps]), T_child_cam), notes
+    return None, notes
+
+
 def true_poses(
     logs: dict[str, Log], tree: Tree, camera_frame: str, ns: list[int]
 ) -> tuple[Float[np.ndarray, "n 4 4"] | None, tuple[str, ...]]:
@@ -63,19 +99,11 @@ def true_poses(
     Returns:
         T_world_cam interpolated to the images, NaN where nothing is near; notes on what it is.
     """
-    names, notes = [str(timestamp) for timestamp in ns], []
-    for topic, (child, values) in logs.items():
-        stamps = [at for at in sorted(values) if np.isfinite(values[at]).all()]
-        T_child_cam = tree.static(child, camera_frame) if child else np.eye(4)
-        if T_child_cam is None:
-            notes.append(f"{topic} left out: no transform from {child} to {camera_frame} in /tf_static")
-        elif len(stamps) > 1:
-            known = Trajectory(seconds(stamps, ns[0]), np.stack([values[at] for at in stamps]))
-            poses = poses_at(known, seconds(ns, ns[0])) @ T_child_cam
-            notes.append(f"ground truth: {topic}, poses of {child or f'{camera_frame}, as it does not say'}")
-            if lost := len(values) - len(stamps):
-                notes.append(f"{lost} of {len(values)} poses of {topic} left out, with NaN or no quaternion")
-            break
+    names = [str(timestamp) for timestamp in ns]
+    found, notes = leading_poses(logs, tree, camera_frame, fewest=2)
+    if found is not None:
+        known = Trajectory(seconds(found.ns, ns[0]), found.T_world_child)
+        poses = poses_at(known, seconds(ns, ns[0])) @ found.T_child_cam
     else:
         poses = tree.at(camera_frame, ns)
         if poses is None:
