@@ -8,7 +8,7 @@ from helpers.wall import CAMERA, rays, wall
 from numpy.testing import assert_allclose, assert_array_equal
 
 from jaxpose.geometry.camera import Camera
-from jaxpose.slam.map.normals import seen_by, tangent_planes
+from jaxpose.slam.map.integrate import seen_by, tangent_planes
 from jaxpose.slam.observation import Image, depth_sigma, locate
 
 ACROSS = np.array([0.0, 0, -1])

@@ -12,7 +12,6 @@ from jaxpose.slam.keyframes import unlikeness
 from jaxpose.slam.map.backend import map_backend, scene_params
 from jaxpose.slam.observation import Image, is_blank
 from jaxpose.slam.rolling_shutter import at_first_row
-from jaxpose.slam.tracking.feature_pose import feature_nis, seen_pose, with_features
 from jaxpose.slam.tracking.features import Features
 from jaxpose.slam.tracking.predict import (
     BEHIND,
@@ -20,12 +19,15 @@ from jaxpose.slam.tracking.predict import (
     TrackingProblem,
     constant_velocity,
     end_velocity,
+    feature_nis,
     imu_sigmas,
     observe_acceleration,
     observe_gyro_bias,
     predict,
     prediction_sigma,
     readings_between,
+    seen_pose,
+    with_features,
     worst_sigmas,
 )
 from jaxpose.slam.tracking.reference_frames import reference_frame
@@ -82,7 +84,8 @@ def next_pose(
     if lost:
         return _update_state(state, state.frames, predicted, by_motion, tracked, TrackingStatus.LOST)
     if seen is not None:
-        frames = frames.put(-1, feature_nis=feature_nis(state, frames, used, seen, tracked))
+        found = np.asarray(tracked.T_ref_body), np.asarray(tracked.information)
+        frames = frames.put(-1, feature_nis=feature_nis(state, frames, used, seen, *found))
     weak = (np.asarray(tracked.sigma) > policy.weak).any()
     status = TrackingStatus.WEAK if weak else TrackingStatus.TRACKED
     if (

@@ -20,8 +20,8 @@ from jaxpose.slam.loops.drift import drift_to_last, may_be_doubled, motion_sigma
 from jaxpose.slam.loops.rebuild import posed, rebuilt_map
 from jaxpose.slam.loops.verify import Verified, verify
 from jaxpose.slam.map.backend import seen_points
-from jaxpose.slam.tracking.feature_pose import FIRST_SCALE
 from jaxpose.slam.tracking.features import locate_camera
+from jaxpose.slam.tracking.predict import FIRST_FEATURE_SCALE
 from jaxpose.slam.types import Frames, SlamState
 
 _LEAST_SIGMA = 1e-5  # [m, rad] of a motion
@@ -114,7 +114,7 @@ def is_same_place(verified: Verified, policy: LoopConfig) -> bool:
         and compared.conflict < policy.conflict
         and compared.colour > policy.colour
         and np.sqrt(worst) < policy.sigma
-        and apart @ np.linalg.solve(FIRST_SCALE * features.covariance, apart) < CHI2_999
+        and apart @ np.linalg.solve(FIRST_FEATURE_SCALE * features.covariance, apart) < CHI2_999
     )
 
 

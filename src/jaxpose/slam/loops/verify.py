@@ -18,11 +18,10 @@ from jaxpose.datasets.types import Frame
 from jaxpose.geometry.camera import Camera, project
 from jaxpose.imu import AnyArray
 from jaxpose.slam.config import TrackConfig
-from jaxpose.slam.map.integrate import MapSample
-from jaxpose.slam.map.normals import seen_by
+from jaxpose.slam.map.integrate import MapSample, seen_by
 from jaxpose.slam.observation import back_project, depth_sigma, locate, sample_pixels, to_device
-from jaxpose.slam.tracking.feature_pose import FIRST_SCALE
 from jaxpose.slam.tracking.features import FeaturePose
+from jaxpose.slam.tracking.predict import FIRST_FEATURE_SCALE
 from jaxpose.slam.tracking.register import image_information, register
 
 _PIXELS = 3000
@@ -52,7 +51,7 @@ class Verified(NamedTuple):
 
 def verify(a: Frame, b: Frame, seen: FeaturePose, camera: Camera) -> Verified:
     """Register the depth of b to that of a, from the pose that features have found."""
-    covariance = FIRST_SCALE * seen.covariance
+    covariance = FIRST_FEATURE_SCALE * seen.covariance
     as_float = lambda x: jnp.asarray(x, jnp.float32)
     compared = jax.device_get(
         _compare(camera)(to_device(a), to_device(b), as_float(seen.T_world_cam), as_float(covariance))

@@ -18,8 +18,7 @@ from jaxpose.geometry.camera import Camera
 from jaxpose.scenes import SceneField
 from jaxpose.scenes.voxel_blocks import CELLS, BlockConfig, Blocks, block_at, trilinear_in_block
 from jaxpose.slam.keyframes import Keyframe
-from jaxpose.slam.map.integrate import in_view_test
-from jaxpose.slam.map.normals import seen_by
+from jaxpose.slam.map.integrate import in_view_test, seen_by
 from jaxpose.slam.observation import locate
 
 _FINER = 2  # texture cells along one of the map's
