@@ -12,6 +12,8 @@ from scipy.spatial.transform import Rotation
 
 KINDS = ("ros1", "sqlite3", "mcap")
 _TF = "geometry_msgs/TransformStamped[] transforms"
+_EVENT = "uint16 x\nuint16 y\ntime ts\nbool polarity"
+_EVENT_ARRAY = "std_msgs/Header header\nuint32 height\nuint32 width\nEvent[] events"
 
 
 class Message(NamedTuple):
@@ -140,3 +142,30 @@ class Maker:
                 raw = serialize(message.content, message.kind)
                 writer.write(connections[message.topic], message.recorded_ns, raw)
         return path
+
+
+def event_bag(folder, kind, columns, size, K, poses_ns, poses, *, D=(), package="dvs_msgs", per=100) -> Path:
+    """Events (t [ns], x, y, on) in arrays of `per`, the camera that saw them, and its poses."""
+    maker, messages = Maker(kind), []
+    event = _EVENT if kind == "ros1" else _EVENT.replace("time", "builtin_interfaces/Time")
+    maker.store.register(get_types_from_msg(event, f"{package}/msg/Event"))
+    maker.store.register(get_types_from_msg(_EVENT_ARRAY, f"{package}/msg/EventArray"))
+    Event, Time = maker.of(f"{package}/msg/Event"), maker.of("builtin_interfaces/msg/Time")
+    for start in range(0, len(columns[0]), per):
+        rows = zip(*(column[start : start + per].tolist() for column in columns), strict=True)
+        events = [
+            Event(x=x, y=y, ts=Time(sec=t // 10**9, nanosec=t % 10**9), polarity=bool(on))
+            for t, x, y, on in rows
+        ]
+        ns = int(columns[0][start])
+        array = maker.of(f"{package}/msg/EventArray")(
+            header=maker.header(ns, "davis"), height=size[1], width=size[0], events=events
+        )
+        messages.append(Message("/dvs/events", f"{package}/msg/EventArray", ns, array))
+    first = poses_ns[0]
+    info = maker.camera_info(first, "davis", K, size, D=D)
+    messages.append(Message("/dvs/camera_info", "sensor_msgs/msg/CameraInfo", first, info))
+    for at, T in zip(poses_ns, poses, strict=True):
+        pose = maker.pose_stamped(at, "map", T)
+        messages.append(Message("/pose", "geometry_msgs/msg/PoseStamped", at, pose))
+    return maker.write(folder, messages)

@@ -3,15 +3,13 @@
 import numpy as np
 import pytest
 from helpers import event_writers
-from helpers.ros_bags import Maker, Message
+from helpers.ros_bags import Maker, Message, event_bag
 from rosbags.typesys import get_types_from_msg
 
 from jaxpose.datasets.events import registry
 from jaxpose.errors import DataError
 
 T0_NS, COUNT, SIZE = 1_403_715_523_912_143_000, 997, (346, 260)
-EVENT = "uint16 x\nuint16 y\ntime ts\nbool polarity"
-ARRAY = "std_msgs/Header header\nuint32 height\nuint32 width\nEvent[] events"
 PACKET = (
     "std_msgs/Header header\nuint32 height\nuint32 width\nuint64 seq\nuint64 time_base\nstring encoding\n"
     "bool is_bigendian\nuint8[] events"
@@ -22,30 +20,13 @@ X, Y, ON = rng.integers(0, 346, COUNT), rng.integers(0, 260, COUNT), rng.integer
 
 
 def bag(folder, kind, package="dvs_msgs", per=100):
-    maker, messages = Maker(kind), []
-    event = EVENT if kind == "ros1" else EVENT.replace("time", "builtin_interfaces/Time")
-    maker.store.register(get_types_from_msg(event, f"{package}/msg/Event"))
-    maker.store.register(get_types_from_msg(ARRAY, f"{package}/msg/EventArray"))
-    Event, Time = maker.of(f"{package}/msg/Event"), maker.of("builtin_interfaces/msg/Time")
-    for start in range(0, COUNT, per):
-        events = [
-            Event(x=int(x), y=int(y), ts=Time(sec=int(t) // 10**9, nanosec=int(t) % 10**9), polarity=bool(p))
-            for t, x, y, p in zip(*(column[start : start + per] for column in (T_NS, X, Y, ON)), strict=True)
-        ]
-        ns = int(T_NS[start])
-        array = maker.of(f"{package}/msg/EventArray")(
-            header=maker.header(ns, "davis"), height=SIZE[1], width=SIZE[0], events=events
-        )
-        messages.append(Message("/dvs/events", f"{package}/msg/EventArray", ns, array))
-    info = maker.camera_info(T0_NS, "davis", (200.0, 201.0, 170.0, 130.0), SIZE, D=(0.1, 0.0, 0.0, 0.0, 0.0))
-    messages.append(Message("/dvs/camera_info", "sensor_msgs/msg/CameraInfo", T0_NS, info))
-    for k in range(5):
-        at, T = T0_NS + 250_000_000 * k, np.eye(4)
-        T[0, 3] = k
-        messages.append(
-            Message("/pose", "geometry_msgs/msg/PoseStamped", at, maker.pose_stamped(at, "map", T))
-        )
-    return maker.write(folder, messages)
+    T = np.tile(np.eye(4), (5, 1, 1))
+    T[:, 0, 3] = np.arange(5)
+    return event_bag(
+        folder, kind, (T_NS, X, Y, ON), SIZE, (200.0, 201.0, 170.0, 130.0),
+        [T0_NS + 250_000_000 * k for k in range(5)], T,
+        D=(0.1, 0.0, 0.0, 0.0, 0.0), package=package, per=per,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize(

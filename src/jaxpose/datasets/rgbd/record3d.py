@@ -1,4 +1,6 @@
-"""Record3D's `.r3d` of a phone: a zip of `metadata` (JSON) and of `rgbd/N.jpg`, `N.depth` and `N.conf`."""
+"""Record3D's exports of a phone: `.r3d`, a zip of `metadata` (JSON) and `rgbd/N.jpg`, `N.depth`, `N.conf`;
+"EXR + JPG", `metadata.json` with `rgb/N.jpg` and `depth/N.exr`; and its RGBD video (`record3d_video`).
+"""
 
 import io
 import re
@@ -14,6 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from jaxpose.datasets.images import Pinhole, check_intrinsics, found, some
 from jaxpose.datasets.photos.common import OPENGL
+from jaxpose.datasets.rgbd import record3d_video
+from jaxpose.datasets.rgbd.exr import read_exr
 from jaxpose.datasets.rgbd.frames import Images, Poses, assembled, visible
 from jaxpose.datasets.rgbd.phones import UNSURE, Y_UP, middle, sure
 from jaxpose.datasets.types import Recording
@@ -25,8 +29,10 @@ from jaxpose.geometry import rigid
 from jaxpose.geometry.camera import Camera, resized
 
 EXTRA = 'pip install -e ".[phone]"'
-_METADATA = re.compile(r"(.*/)?metadata")
-_ENTRY = re.compile(r"rgbd/(\d{1,18})\.(jpg|depth|conf)")
+_METADATA = re.compile(r"(.*/)?metadata(\.json)?")
+_ENTRY = re.compile(r"(?:rgbd|rgb|depth|conf)/(\d{1,18})\.(jpe?g|png|depth|exr|conf)", re.IGNORECASE)
+_KINDS = {"jpg": "color", "jpeg": "color", "png": "color", "depth": "depth", "exr": "depth", "conf": "conf"}
+_FOLDERS = ("rgbd", "rgb", "depth", "conf")
 _MOST_BYTES = 1 << 28  # of an entry
 
 
@@ -48,17 +54,22 @@ def detect(path: Path) -> bool:
     Returns:
         Whether `load` should read it.
     """
+    if record3d_video.detect(path):
+        return True
     if path.is_dir():
-        return (path / "metadata").is_file() and (path / "rgbd").is_dir()
+        raw = (path / "metadata").is_file() and (path / "rgbd").is_dir()
+        exr = (path / "depth").glob("*.[eE][xX][rR]")
+        return raw or ((path / "metadata.json").is_file() and any(exr))
     if path.suffix.lower() == ".zip" and zipfile.is_zipfile(path):
         with reading(path, "a zip"), zipfile.ZipFile(path) as archive:
             names = archive.namelist()
-        return any(_METADATA.fullmatch(name) for name in names) and any("rgbd/" in name for name in names)
+        of_frames = any("rgbd/" in name or name.lower().endswith(".exr") for name in names)
+        return of_frames and any(_METADATA.fullmatch(name) for name in names)
     return path.suffix.lower() == ".r3d" and path.is_file()
 
 
 def load(path: Path | str) -> Recording:
-    """Read a video of Record3D. Its depth, where compressed, needs the package lzfse (extra `phone`).
+    """Read an export of Record3D. Its depth needs a package of the extra `phone`: lzfse, OpenEXR or av.
 
     Nothing is unpacked to disk; a zip may hold its folder. Poses are ARKit's, quaternion xyzw and position,
     of a camera with OpenGL's axes that is turned as the images are; its world's y points up. Intrinsics are
@@ -66,7 +77,7 @@ def load(path: Path | str) -> Recording:
     where the confidence is 0; colour is resized to it. Times are `frameTimestamps`, else those of `fps`.
 
     Args:
-        path: The `.r3d`, or the folder of an unpacked one.
+        path: The `.r3d`, the folder of an unpacked one or of EXR + JPG, a zip of these, or the RGBD video.
 
     Returns:
         The recording; its notes say what was left out or assumed.
@@ -74,26 +85,28 @@ def load(path: Path | str) -> Recording:
     Raises:
         DataError: Naming the file for anything that cannot be used.
     """
-    source = _open(Path(path))
-    entries: dict[str, set[int]] = {"jpg": set(), "depth": set(), "conf": set()}
+    path = Path(path)
+    if record3d_video.detect(path):
+        return record3d_video.load(path)
+    source = _open(path)
+    entries: dict[str, dict[int, str]] = {"color": {}, "depth": {}, "conf": {}}
     for name in source.names:
         if match := _ENTRY.fullmatch(name):
-            entries[match[2]].add(int(match[1]))
-    frames = sorted(entries["jpg"] & entries["depth"])
+            entries[_KINDS[match[2].lower()]][int(match[1])] = name
+    colors, depths = entries["color"], entries["depth"]
+    frames = sorted(colors.keys() & depths.keys())
     if not frames:
         raise DataError(
-            f"{path}: expected rgbd/N.jpg with rgbd/N.depth, got {some(source.names) or 'nothing'}"
+            f"{path}: expected rgbd/N.jpg with rgbd/N.depth, or rgb/N.jpg with depth/N.exr, "
+            f"got {some(source.names) or 'nothing'}"
         )
-    depth_side = lambda key: int(numbers(source.path, source.content, key, whole=True, least=1))
-    width, height = depth_side("dw"), depth_side("dh")
-    size = _decode(source, f"rgbd/{frames[0]}.jpg").size
     images = Images(
-        size,
-        lambda i, to: _color(source, f"rgbd/{frames[i]}.jpg", to),
-        lambda i: _depth(source, frames[i], (height, width), frames[i] in entries["conf"]),
-        lambda i: f"{frames[i]}.depth",
+        _decode(source, colors[frames[0]]).size,
+        lambda i, to: _color(source, colors[frames[i]], to),
+        lambda i: _depth(source, depths[frames[i]], entries["conf"].get(frames[i])),
+        lambda i: Path(depths[frames[i]]).name,
     )
-    lost = [str(frame) for frame in sorted(entries["jpg"] ^ entries["depth"])]
+    lost = [str(frame) for frame in sorted(colors.keys() ^ depths.keys())]
     notes = [f"{len(lost)} frames left out, without colour or depth: {some(lost)}"] if lost else []
     return assembled(
         source.path,
@@ -102,7 +115,7 @@ def load(path: Path | str) -> Recording:
         t=_times(source, frames),
         names=[str(frame) for frame in frames],
         poses=_poses(source, frames),
-        first_color=f"{frames[0]}.jpg",
+        first_color=Path(colors[frames[0]]).name,
         notes=(*notes, *([UNSURE] if entries["conf"] else [])),
         gravity_world=Y_UP,
     )
@@ -110,15 +123,20 @@ def load(path: Path | str) -> Recording:
 
 def _open(path: Path) -> _Source:
     if path.is_dir():
-        names = [f"rgbd/{file.name}" for file in visible(path / "rgbd")] if (path / "rgbd").is_dir() else []
+        inner = [folder for name in _FOLDERS if (folder := path / name).is_dir()]
+        names = [f"{folder.name}/{file.name}" for folder in inner for file in visible(folder)]
+        stated = next(
+            (path / f for f in ("metadata", "metadata.json") if (path / f).is_file()), path / "metadata"
+        )
         read = lambda name: (path / name).read_bytes()
-        return _Source(path, names, read, read_json(path / "metadata", "the metadata of Record3D"))
+        return _Source(path, names, read, read_json(stated, "the metadata of Record3D"))
     if not path.is_file():
         raise DataError(f"{path}: expected an archive of Record3D, got {found(path)}")
     with reading(path, "an archive of Record3D (a zip)"):
         archive = zipfile.ZipFile(path)
         names = archive.namelist()
-    top = next((name.removesuffix("metadata") for name in names if _METADATA.fullmatch(name)), "")
+    stated = next((name for name in names if _METADATA.fullmatch(name)), "metadata")
+    top = stated[: stated.rindex("metadata")]
 
     def read(name: str) -> bytes:
         with reading(f"{path}: {name}", "an entry that can be read"):
@@ -126,10 +144,8 @@ def _open(path: Path) -> _Source:
                 raise ValueError(f"{archive.getinfo(top + name).file_size} bytes")
             return archive.read(top + name)
 
-    names = [name.removeprefix(top) for name in names]
-    return _Source(
-        path, names, read, json_object(read("metadata"), f"{path}: metadata", "metadata of Record3D")
-    )
+    content = json_object(read(stated.removeprefix(top)), f"{path}: metadata", "metadata of Record3D")
+    return _Source(path, [name.removeprefix(top) for name in names], read, content)
 
 
 def _decode(source: _Source, name: str) -> Image.Image:
@@ -143,13 +159,17 @@ def _color(source: _Source, name: str, to: tuple[int, int] | None) -> np.ndarray
     return np.asarray(image if to is None else image.resize(to, Image.Resampling.BILINEAR))
 
 
-def _depth(source: _Source, frame: int, shape: tuple[int, int], has_confidence: bool) -> np.ndarray:
-    depth = _plane(source, f"rgbd/{frame}.depth", np.dtype("<f4"), shape)
+def _depth(source: _Source, name: str, confidence: str | None) -> np.ndarray:
+    if name.lower().endswith(".exr"):
+        depth = read_exr(source.read(name), f"{source.path}: {name}")
+    else:
+        side = lambda key: int(numbers(source.path, source.content, key, whole=True, least=1))
+        depth = _plane(source, name, np.dtype("<f4"), (side("dh"), side("dw")))
     depth = np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
-    if not has_confidence:
+    if confidence is None:
         return depth
-    name = f"rgbd/{frame}.conf"
-    return sure(depth, _plane(source, name, np.dtype(np.uint8), shape), f"{source.path}: {name}")
+    plane = _plane(source, confidence, np.dtype(np.uint8), depth.shape)
+    return sure(depth, plane, f"{source.path}: {confidence}")
 
 
 def _plane(source: _Source, name: str, kind: np.dtype, shape: tuple[int, int]) -> np.ndarray:

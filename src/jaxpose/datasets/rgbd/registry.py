@@ -75,11 +75,11 @@ LAYOUTS: dict[Format, Layout] = {
         "a made file in k4arecorder's layout",
     ),
     "record3d": Layout(
-        "Record3D (extra `phone`)",
-        ("*.r3d|metadata", "*.r3d|rgbd/*.jpg", "*.r3d|rgbd/*.depth"),
+        "Record3D: r3d, EXR + JPG, RGBD video (extra `phone`)",
+        ("*.r3d|metadata|metadata.json", "*.r3d|rgbd/*.jpg|rgb/*.jpg", "*.r3d|rgbd/*.depth|depth/*.exr"),
         record3d,
         (),
-        "a zip in the app's layout, by lzfse",
+        "files in the app's layouts, by lzfse, OpenEXR and PyAV",
     ),
     "stray_scanner": Layout(
         "Stray Scanner (extra `video`)",
