@@ -46,3 +46,10 @@ def test_what_is_no_video_is_one_line(tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "av", None)
     with pytest.raises(DataError, match=r'needs the package av: pip install -e ".\[video\]"'):
         Video(path)
+
+
+def test_a_codec_that_is_not_there_is_named(tmp_path):
+    path = write_video(tmp_path / "a.mp4", [flat(k) for k in range(3)])
+    path.write_bytes(path.read_bytes().replace(b"avc1", b"zzz1"))
+    with pytest.raises(DataError, match="a.mp4: expected a video, got one of a codec that is not known here"):
+        Video(path)

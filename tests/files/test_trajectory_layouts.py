@@ -203,3 +203,56 @@ def test_evo_reads_what_is_written(tmp_path):
     theirs = file_interface.read_tum_trajectory_file(tmp_path / "out")
     np.testing.assert_allclose(np.array(theirs.poses_se3)[:, :3, :], found.trajectory.T[:, :3, :], atol=1e-8)
     np.testing.assert_allclose(theirs.timestamps * 1e9, [float(ns) for ns in FLOAT_NS], rtol=0, atol=300)
+
+
+SECONDS = [k / 10 for k in range(COUNT)]
+HEAD = "t,x,y,z,qx,qy,qz,qw\n"
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda text: text.replace("\n0.3,", " # lost\n0.3,"),
+        lambda text: text.replace(",", ";").replace(".", ","),  # a spreadsheet's in Europe
+        lambda text: text.replace(",", ";"),
+    ],
+)
+def test_what_people_do_to_tables(tmp_path, change):
+    file = csv(tmp_path / "a.csv", SECONDS, SAME, head=HEAD)
+    file.write_text(change(file.read_text()))
+    found = read_trajectory(file)
+    np.testing.assert_allclose(found.trajectory.t, SECONDS)
+    np.testing.assert_allclose(found.trajectory.T[:, :3, 3], POSITION, atol=1e-9)
+
+
+def test_empty_cells_at_the_end_of_a_row_are_a_gap(tmp_path):
+    file = csv(tmp_path / "a.csv", SECONDS, SAME, head=HEAD)
+    lines = file.read_text().splitlines()
+    lines[4] = "0.3" + "," * 7
+    file.write_text("\n".join(lines))
+    found = read_trajectory(file)
+    assert found.missing == 1 and len(found.trajectory.t) == COUNT - 1
+
+
+@pytest.mark.parametrize("unit, metres", [("mm", 1e-3), ("cm", 1e-2), ("m", 1.0)])
+def test_units_of_the_position_are_those_of_the_header(tmp_path, unit, metres):
+    head = f"t [s],x [{unit}],y [{unit}],z [{unit}],qx,qy,qz,qw\n"
+    found = read_trajectory(csv(tmp_path / "a.csv", SECONDS, SAME, head=head))
+    np.testing.assert_allclose(found.trajectory.T[:, :3, 3], metres * POSITION, atol=1e-9)
+    assert bool(found.notes) == (unit != "m")
+    csv(tmp_path / "a.csv", SECONDS, SAME, head=head.replace(f"[{unit}]", "[px]"))
+    with pytest.raises(DataError, match="expected a position in m, mm, .*, got px"):
+        read_trajectory(tmp_path / "a.csv")
+
+
+def test_ns_from_0_are_no_seconds_of_many_years(tmp_path):
+    """Two seconds of ns end where a date of seconds could be."""
+    found = read_trajectory(csv(tmp_path / "a.txt", [2 * k * 10**8 for k in range(COUNT)], SAME, mark=" "))
+    assert found.unit == "ns"
+    np.testing.assert_allclose(found.trajectory.t, 0.2 * np.arange(COUNT))
+
+
+def test_what_a_header_lacks_is_named(tmp_path):
+    (tmp_path / "a.csv").write_text("t,x,y,z,roll,pitch,yaw\n0,0,0,0,0,0,0\n1,0,0,0,0,0,0\n")
+    with pytest.raises(DataError, match="got a header without qx qy qz qw$"):
+        read_trajectory(tmp_path / "a.csv")

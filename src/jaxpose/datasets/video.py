@@ -63,6 +63,8 @@ class Video:
         try:
             self._container = av.open(str(path))
             self._stream = self._container.streams.video[track]
+            if self._stream.codec_context is None:
+                raise ValueError("one of a codec that is not known here")
             self._stream.thread_type = "AUTO"
             self.size = (self._stream.codec_context.width, self._stream.codec_context.height)
         except Exception as error:

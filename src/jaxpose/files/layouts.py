@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxpose.errors import DataError
-from jaxpose.files.columns import POSE, column_names, match_names, named_columns
+from jaxpose.files.columns import POSE, Named, column_names, match_names, named_columns, named_parts
 from jaxpose.files.tables import Table
 from jaxpose.files.timestamps import Unit, to_decimal, to_stamps, units
 
@@ -20,6 +20,7 @@ KNOWN = (
 )
 _ORDER = ("t", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
 _XYZW, _WXYZ = tuple(range(8)), (0, 1, 2, 3, 5, 6, 7, 4)
+_METRES = {"": 1.0, "m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3, "um": 1e-6, "in": 0.0254, "ft": 0.3048}
 _OFF_UNIT = 1e-2  # of a quaternion's length; more is not rounding
 
 
@@ -33,6 +34,7 @@ class Layout(NamedTuple):
     unit_is_stated: bool = False  # by a header or by the user
     refused_unit: Unit | None = None  # timestamps in it would mean another layout
     order: Literal["xyzw", "wxyz"] | None = None
+    metres: float = 1.0  # of a unit of the position
 
 
 TUM = Layout("TUM", _XYZW, "8 numbers (t tx ty tz qx qy qz qw)", order="xyzw")
@@ -80,7 +82,8 @@ def pose_layout(path: Path, table: Table, columns: str | None) -> Layout:
         known = known if named.unit in (None, known.unit) else _CSV
         words = f"{width} columns, {', '.join(_ORDER)} among them"
         unit = named.unit or ("ns" if known is EUROC else "s")
-        return Layout(known.format, at, words, unit, named.unit is not None, order=order)
+        metres = _metres(path, named)
+        return Layout(known.format, at, words, unit, named.unit is not None, order=order, metres=metres)
     if width in (4, 12, 16):
         return Layout("KITTI" if width == 12 else "4x4 list", None, "")
     if table.separator is None and width == 8:
@@ -88,7 +91,21 @@ def pose_layout(path: Path, table: Table, columns: str | None) -> Layout:
     if table.separator is not None and width in (8, 11, 17):
         return _unnamed_csv(path, table, width)
     line = (table.separator or " ").join(table.words(0))
-    raise DataError(f"{path}:{table.lines[0]}: expected a trajectory, {KNOWN}, got {line[:60]!r}")
+    got = repr(line[:60])
+    for header in table.headers:
+        if len(there := named_parts(header, table, POSE)) > 2:
+            got = f"a header without {' '.join(name for name in _ORDER if name not in there)}"
+    raise DataError(f"{path}:{table.lines[0]}: expected a trajectory, {KNOWN}, got {got}")
+
+
+def _metres(path: Path, named: Named) -> float:
+    """What the unit of the position that a header states is in metres."""
+    stated = sorted({named.stated[f"t{axis}"].lower() for axis in "xyz"} - {""})
+    if len(stated) > 1 or not {*stated} <= _METRES.keys():
+        raise DataError(
+            f"{path}: expected a position in {', '.join(_METRES)[2:]}, got {' and '.join(stated)}"
+        )
+    return _METRES[stated[0]] if stated else 1.0
 
 
 def _unnamed_csv(path: Path, table: Table, width: int) -> Layout:

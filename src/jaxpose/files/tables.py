@@ -8,7 +8,7 @@ is refused.
 
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from decimal import Decimal
 from operator import lt
 from pathlib import Path
@@ -20,7 +20,7 @@ from jaxtyping import Float
 from jaxpose.errors import DataError
 from jaxpose.files import timestamps
 from jaxpose.files.schema import FARTHEST_M
-from jaxpose.files.texts import read_text
+from jaxpose.files.texts import lines_of
 from jaxpose.files.timestamps import POSES, Stamps, Steps, Unit, format_ns, to_decimal, to_stamps, units
 
 _FEW = 50  # rows, of which each is sooner read by itself
@@ -62,7 +62,7 @@ def numbered_lines(path: Path) -> list[tuple[int, str]]:
 
     They come without blanks around them, and without those that begin with #.
     """
-    return [(k, line) for k, line in _all_lines(path) if line[0] != "#"]
+    return [(k, line) for k, line in lines_of(path) if line[0] != "#"]
 
 
 def read_table(path: Path) -> Table:
@@ -72,14 +72,14 @@ def read_table(path: Path) -> Table:
         path: The file.
 
     Returns:
-        Its rows, separated by commas or semicolons where the first has any, else by blanks; a separator at
-        the end of a line begins no column.
+        Its rows, separated by semicolons or commas where the first has any, else by blanks; a separator at
+        the end of a line begins no column, unless one is lacking.
     """
     headers: list[str] = []
     comments: list[tuple[int, str]] = []
     lines, rows = [], []
-    separator = None
-    for number, quoted in _all_lines(path):
+    separator, width = None, 0  # of the first row
+    for number, quoted in lines_of(path):
         line = quoted.replace('"', "") or "#"
         if line[0] in "#%":
             comments.append((number, line.lstrip("#%").strip()))
@@ -90,14 +90,20 @@ def read_table(path: Path) -> Table:
             separator = _separator(line)
         if line[0] in "#%":
             continue
+        line = re.sub(r"\s+#.*", "", line)
+        if separator == ";":  # between decimal commas, where there are any
+            line = line.replace(",", ".")
+        if separator and line[-1] == separator and line.count(separator) >= width:
+            line = line[:-1].rstrip()
+        width = width or len(line.split(separator))
         lines.append(number)
-        rows.append(line[:-1].rstrip() if line[-1] == separator else line)
+        rows.append(line)
     return Table(lines, rows, separator, tuple(headers), tuple(comments))
 
 
 def find_separator(path: Path) -> str | None:
     """The separator of a table's first row, as `read_table` finds it."""
-    rows = (line for _, line in _all_lines(path) if line[0] not in "#%" and _is_row(line))
+    rows = (line for _, line in lines_of(path) if line[0] not in "#%" and _is_row(line))
     return _separator(next(rows, ""))
 
 
@@ -356,14 +362,8 @@ def format_rows(rows: Float[np.ndarray, "n c"]) -> str:
     return "".join(" ".join(map(repr, row)) + "\n" for row in np.asarray(rows, np.float64).tolist())
 
 
-def _all_lines(path: Path) -> Iterator[tuple[int, str]]:
-    """Lines with something on them, without blanks around them, and their numbers from 1."""
-    text = read_text(path).splitlines()
-    return ((k, stripped) for k, line in enumerate(text, 1) if (stripped := line.strip()))
-
-
 def _separator(row: str) -> str | None:
-    return next((mark for mark in ",;" if mark in row), None)
+    return next((mark for mark in ";," if mark in row), None)
 
 
 def _is_row(line: str) -> bool:

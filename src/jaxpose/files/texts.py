@@ -1,5 +1,6 @@
 """Text as other programs and systems write it."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 from jaxpose.errors import DataError
@@ -51,3 +52,19 @@ def read_text(path: Path) -> str:
     if b"\0" in content[:_LOOKED_AT]:
         raise DataError(f"{path}: expected text, got bytes that are none")
     return content.decode("utf-8-sig", errors="replace")
+
+
+def lines_of(path: Path) -> Iterator[tuple[int, str]]:
+    """The lines of a text with something on them, without blanks around them.
+
+    Args:
+        path: The file.
+
+    Returns:
+        Their numbers, from 1, and the lines.
+
+    Raises:
+        DataError: As `read_text`.
+    """
+    text = read_text(path).splitlines()
+    return ((k, stripped) for k, line in enumerate(text, 1) if (stripped := line.strip()))

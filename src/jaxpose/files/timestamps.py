@@ -36,6 +36,7 @@ POSES = Steps(5e-4, 2.0, 3600.0)
 READINGS = Steps(1.2e-4, 0.2, 1.0)  # of an IMU
 _DIGITS_NS = 1e3  # steps of ns below it have no decimals
 _LEAST_S = 1e-5  # steps below it make no sense
+_FARTHEST_S = 1e6  # steps above it are no dates of one recording
 
 
 class Stamps(NamedTuple):
@@ -143,9 +144,10 @@ def units(stamps: Stamps, expected: Unit, steps: Steps = POSES) -> list[Unit]:
     scale = 10**stamps.digits
     latest = max(map(abs, stamps.whole)) / scale
     size = {unit: latest / PER_SECOND[unit] for unit in get_args(Unit)}
-    dated = [unit for unit, s in size.items() if _SINCE_1970_S[0] <= s <= _SINCE_1970_S[1]]
     whole = stamps.digits == 0 or not any(number % scale for number in stamps.whole)
     step = _median_step(stamps)
+    near = {unit: step is None or step / PER_SECOND[unit] <= _FARTHEST_S for unit in size}
+    dated = [u for u, s in size.items() if _SINCE_1970_S[0] <= s <= _SINCE_1970_S[1] and near[u]]
     if not whole and (step is None or step < _DIGITS_NS):
         size.pop("ns")
     if expected in dated and expected in size:

@@ -123,6 +123,8 @@ def read_trajectory(path: Path | str, columns: str | None = None) -> TrajectoryF
     notes += left_out_notes(path, rows)
     if rows.unit != layout.unit:
         notes += (f"{path.name}: timestamps are in {rows.unit}, by their size and steps",)
+    if layout.metres != 1:
+        notes += (f"{path.name}: positions are in units of {layout.metres:g} m, by the header",)
     return TrajectoryFile(
         trajectory,
         layout.format,
@@ -343,7 +345,7 @@ def _poses(
         )
     t0_ns, xyzw = origin(rows.ns), rows.values[:, 3:]
     t = rows.stamps.since(t0_ns, rows.unit)
-    T = rigid.make(Rotation.from_quat(xyzw).as_matrix(), rows.values[:, :3])
+    T = rigid.make(Rotation.from_quat(xyzw).as_matrix(), layout.metres * rows.values[:, :3])
     return Trajectory(t, T, t0_ns), xyzw, rows
 
 

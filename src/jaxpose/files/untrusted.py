@@ -335,8 +335,7 @@ def read_yaml(path: Path | str, wanted: str) -> dict[str, Any]:
 
 
 def _text(path: Path, most: int) -> str:
-    size = path.stat().st_size
-    if size > most:
+    if (size := path.stat().st_size) > most:
         raise ValueError(f"{size} bytes, more than {most}")
     return read_text(path)
 
@@ -347,8 +346,9 @@ def _numeric(value: Any) -> Any:
         return {key: _numeric(entry) for key, entry in value.items()}
     if isinstance(value, list):
         return [_numeric(entry) for entry in value]
+    words = value.strip("[]() ").replace(",", " ").split()  # several in one text are a list
     try:
-        return float(value)
+        return float(value) if len(words) < 2 else [float(word) for word in words]
     except ValueError:
         return value
 

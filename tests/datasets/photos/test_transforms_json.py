@@ -101,3 +101,21 @@ def test_what_cannot_be_written(tmp_path):
     with pytest.raises(DataError, match="transforms.json: expected a frame of images/other.png, got none"):
         write_transforms(tmp_path / "out.json", other, source=tmp_path / "transforms.json")
     assert not (tmp_path / "out.json").exists()
+
+
+def test_lists_of_a_split_name_images_in_any_spelling(tmp_path):
+    frames = []
+    for k in range(6):
+        Image.new("RGB", (16, 12), (k, 0, 0)).save(tmp_path / f"Shot_{k}.PNG")
+        matrix = np.eye(4)
+        matrix[0, 3] = k
+        frames.append({"file_path": f".\\shot_{k}", "transform_matrix": matrix.tolist()})
+    lists = {
+        "train_filenames": ["./Shot_0.PNG", "Shot_1.PNG", "shot_2.png"],
+        "test_filenames": [f"C:\\data\\Shot_{k}.PNG" for k in (3, 4)],
+    }
+    (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 20, "frames": frames, **lists}))
+    train, held_out = blender.load(tmp_path)
+    assert [image[0, 0, 0] for image in train.rgb] == [0, 1, 2]
+    assert [image[0, 0, 0] for image in held_out.rgb] == [3, 4]
+    assert "1 images left out, which are in neither of the lists used" in train.notes

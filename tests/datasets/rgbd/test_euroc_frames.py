@@ -81,6 +81,15 @@ def vicon(sequence, walk, save):
     return sequence
 
 
+def test_a_sheet_whose_lists_are_texts(tmp_path):
+    pose = " ".join(map(str, T_BODY_CAM.ravel()))
+    text = CAMERA_SHEET.format(pose="0").replace("data: [0]", f'data: "{pose}"')
+    (tmp_path / "a.yaml").write_text(text.replace("[32, 24]", "'32, 24'"))
+    camera, T = read_camera_sheet(tmp_path / "a.yaml")
+    np.testing.assert_array_equal(T, T_BODY_CAM)
+    assert (camera.width, camera.height) == (32, 24)
+
+
 def test_frames_with_given_depth(vicon, walk, metres):
     for path in (vicon, vicon / "mav0"):
         recording = euroc.load(path)

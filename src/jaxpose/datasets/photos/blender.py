@@ -180,7 +180,7 @@ def _read(file: Path) -> _Source:
     common = {key: value for key, value in content.items() if key != "frames"}
     entries = [{**common, **frame} for frame in frames]
     lenses = _lenses(file, entries, images)
-    split, left = _stated_split(file, content, [frame["file_path"] for frame in frames])
+    split, left = _stated_split(file, content, find, images)
     return _Source(
         file=file,
         near_far=stated_depths(file, content),
@@ -216,15 +216,16 @@ def _mask(file: Path, find: Callable[[str], Path | None], frame: dict[str, Any],
 
 
 def _stated_split(
-    file: Path, content: dict[str, Any], names: Sequence[str]
+    file: Path, content: dict[str, Any], find: Callable[[str], Path | None], images: Sequence[Path]
 ) -> tuple[tuple[Int[np.ndarray, " a"], Int[np.ndarray, " b"]] | None, tuple[str, ...]]:
     """Rows to train on and held out where a file lists them, and notes on what that leaves out."""
-    listed = {key: set(map(_plain, content[key])) for key in SPLITS if isinstance(content.get(key), list)}
+    plain = lambda name: os.path.normpath(find(str(name)) or str(name))
+    listed = {key: set(map(plain, content[key])) for key in SPLITS if isinstance(content.get(key), list)}
     if not listed:
         return None, ()
     train, val, test = (listed.get(key, set()) for key in SPLITS)
     held = test or val
-    rows = {_plain(name): row for row, name in enumerate(names)}
+    rows = {os.path.normpath(image): row for row, image in enumerate(images)}
     held_rows = sorted(rows[name] for name in held if name in rows)
     chosen = train if train else rows.keys() - held - val
     train_rows = sorted(rows[name] for name in chosen if name in rows and name not in held)
@@ -234,16 +235,11 @@ def _stated_split(
             f"{len(train_rows)} and {len(held_rows)} of them"
         )
     notes = [f"held out: the {len(held_rows)} images of {SPLITS[2] if test else SPLITS[1]}"]
-    if left := len(names) - len(train_rows) - len(held_rows):
+    if left := len(images) - len(train_rows) - len(held_rows):
         notes.append(f"{left} images left out, which are in neither of the lists used")
     if unknown := len((held | chosen) - rows.keys()):
         notes.append(f"{unknown} names of the lists are those of no frame with an image")
     return (np.array(train_rows), np.array(held_rows)), tuple(notes)
-
-
-def _plain(name: Any) -> str:
-    """The name of an image without what writers do differently."""
-    return os.path.normpath(str(name).replace("\\", "/"))
 
 
 def _times(file: Path, frames: list[dict[str, Any]]) -> tuple[Float[np.ndarray, " n"], bool, tuple[str, ...]]:
