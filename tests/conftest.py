@@ -30,11 +30,12 @@ jax.config.update("jax_debug_key_reuse", True)
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item):
-    """Most of what a test takes is compilation: only what is marked `optimised` is compiled as users have it.
+    """Most of what a test takes is compilation: only what is marked is compiled as users have it.
 
-    These are the numerics that a compiler could break, and what runs longer than it compiles.
+    These are the numerics that a compiler could break (`optimised`), and what runs longer than it compiles
+    (`slow`).
     """
-    compile_quickly(item.get_closest_marker("optimised") is None)
+    compile_quickly(not any(item.get_closest_marker(name) for name in ("optimised", "slow")))
 
 
 @pytest.fixture(params=["float32", "float64"])

@@ -13,7 +13,7 @@ from jaxpose.experiments.event_nerf import pipeline as event_nerf
 from jaxpose.experiments.noisy_nerf import pipeline as noisy_nerf
 from jaxpose.experiments.planar import pipeline as planar
 
-pytestmark = [pytest.mark.slow, pytest.mark.optimised]
+pytestmark = pytest.mark.slow
 
 
 def test_the_room(tmp_path):

@@ -287,7 +287,6 @@ def test_a_registration_is_read_as_it_was_written(tmp_path, far):
 
 
 @pytest.mark.slow
-@pytest.mark.optimised
 def test_poses_by_features_and_a_scene_of_planes(tmp_path, monkeypatch):
     """Half of the orbit, small; killed and resumed it ends with the same numbers, and is read again."""
     config = Config(
@@ -396,7 +395,6 @@ def fern_from_nothing(data_dir, folder, steps):
 
 @pytest.mark.data
 @pytest.mark.slow
-@pytest.mark.optimised
 def test_unknown_poses_of_a_forward_facing_scene_are_found_by_features(data_dir, tmp_path):
     fern = Config(
         data=data_dir / "llff_fern", noise="unknown", steps=600, test_pose_steps=0, out=tmp_path / "r"

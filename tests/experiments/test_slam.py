@@ -232,7 +232,6 @@ def test_a_comparison_takes_what_is_finished_and_puts_it_side_by_side(finished, 
 
 
 @pytest.mark.slow
-@pytest.mark.optimised
 def test_a_comparison_tracks_with_every_mode(tmp_path):
     outcome = imu_slam.run(imu_slam.Config(smoke=True, compare=True, out=tmp_path / "all"))
     assert_side_by_side(outcome)

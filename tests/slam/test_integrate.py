@@ -187,7 +187,6 @@ def test_nothing_is_compiled_anew_while_the_map_grows():
 
 
 @pytest.mark.slow
-@pytest.mark.optimised
 def test_the_gradient_finds_the_same_wall_and_compiles_once():
     config = GridConfig((-0.4, -0.4, 1.2), (0.4, 0.4, 2.4), voxel=0.05, levels=2, truncation=BAND)
     scene = grid(config)

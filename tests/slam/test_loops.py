@@ -149,7 +149,6 @@ def pairs(recording, first: int, last: int):
 
 
 @pytest.mark.slow
-@pytest.mark.optimised
 def test_the_same_place_is_known_and_another_is_not(again):
     recording, _ = again
     lap = round(12.5 / 2 * 8)
@@ -168,7 +167,6 @@ def test_the_same_place_is_known_and_another_is_not(again):
 
 
 @pytest.mark.slow
-@pytest.mark.optimised
 def test_loops_straighten_a_bent_run_and_its_map(again, tmp_path):
     """Poses of a good run bent by 20 cm and 3 degrees over its way; two loops know nothing of that."""
     recording, state = again
@@ -207,7 +205,6 @@ def test_loops_straighten_a_bent_run_and_its_map(again, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.optimised
 def test_frames_in_doubt_are_found_between_their_neighbours_at_the_end(again):
     recording, state = again
     frames, count = state.frames, state.frames.count
