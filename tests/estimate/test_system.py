@@ -47,7 +47,8 @@ def test_every_derivative_is_that_of_finite_differences(control):
     reduced = inertial.node_readings(type(imu)(*(x[inside] for x in imu)), SPAN, INTERVALS)
     with jax.enable_x64(True):
         state = State(
-            jnp.asarray(control), jnp.asarray(rng.normal(size=(3, 6)) * 0.01), jnp.asarray([0.5, 1.0, -9.7]),
+            jnp.asarray(control), *jnp.asarray(rng.normal(size=(2, 3, 6)) * 0.01),
+            jnp.asarray([0.5, 1.0, -9.7]),
             jnp.asarray(0.013), jnp.asarray(T_body_cam), jnp.asarray(0.4),
         )  # fmt: skip
         one = jnp.ones(inertial.BANDS)
@@ -57,14 +58,16 @@ def test_every_derivative_is_that_of_finite_differences(control):
         measured = hand_held.body(poses)[0] @ T_body_cam @ rigid.exp(0.02 * rng.normal(size=(3, 6)))
         problem = Problem(
             jnp.asarray(0.2), jnp.asarray(reduced.root), jnp.asarray(reduced.value), jnp.ones(2),
-            jnp.asarray(poses), jnp.asarray(measured), jnp.asarray(roots), state, prior,
+            jnp.asarray(poses), jnp.asarray(measured), jnp.asarray(roots),
+            jnp.asarray(50 * np.tril(rng.normal(size=(2, 6, 6)))), state, prior,
         )  # fmt: skip
         at = jax.jit(residuals)
         found = at(problem, state, noise)
         assert float(jnp.sum(found.poses.residual**2, axis=1).max()) < 16  # none counts by its size
         groups = {
             "inertial": (found.inertial, np.arange(2)), "motion": (found.motion, np.arange(2)),
-            "walk": (found.walk, np.arange(2)), "poses": (found.poses, np.asarray(found.pair)),
+            "walk": (found.walk, np.arange(2)), "drift": (found.drift, np.arange(2)),
+            "poses": (found.poses, np.asarray(found.pair)),
         }  # fmt: skip
         step = 1e-6
         for unknown in range(3 * BLOCK + BORDER):

@@ -12,6 +12,7 @@ from jaxpose.estimate import solver
 from jaxpose.estimate.blocks import Covariance, Factorisation, solve_rows
 from jaxpose.estimate.inertial import NodeReadings, white_noise
 from jaxpose.estimate.system import (
+    BIAS,
     BLOCK,
     GRAVITY,
     MOUNTING,
@@ -181,7 +182,7 @@ def posterior_of(
     factor, known, _ = solver.spread(at)
     sigma = np.sqrt(np.diag(known.corner)) * np.asarray(problem.prior.free)
     bias = np.asarray(at.state.bias)
-    bias_sigma = np.sqrt(np.diagonal(known.diagonal, axis1=1, axis2=2))[:, 18:]
+    bias_sigma = np.sqrt(np.diagonal(known.diagonal, axis1=1, axis2=2))[:, BIAS]
     sensors = Sensors(
         float(at.state.offset_s),
         float(sigma[OFFSET][0]),

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from jaxpose._checks import check_increasing
+from jaxpose._checks import check_increasing, check_shapes
 from jaxpose.errors import DataError
 from jaxpose.estimate import alignment, inertial, solver
 from jaxpose.estimate.noise_levels import calibrated, first_levels
@@ -31,6 +31,7 @@ _REACH_S = 0.5  # of the offsets that are tried
 # What is known before, one sigma each: what no sensor that works is beyond
 _GYRO_BIAS, _ACCELEROMETER_BIAS = 0.3, 1.0  # rad/s, m/s^2
 _OFFSET_S, _LEVER_M, _TURN, _LOG_SCALE = 1.0, 1.0, 3.0, 10.0
+_NO_DRIFT = 1e-9  # [m, rad] over a block
 _WALK = ImuNoise(0.0, 0.0, 2e-5, 3e-3)  # of biases, where no data sheet says more: EuRoC's sensor
 
 
@@ -48,6 +49,7 @@ def smooth(
     gravity_world: Float[np.ndarray, "3"] | None = None,
     offset_s: float = 0.0,
     knots_hz: float | None = None,
+    drift: Float[np.ndarray, "n 6 6"] | None = None,
 ) -> Posterior:
     """The most likely trajectory through camera poses and inertial readings, and how sure it is.
 
@@ -68,6 +70,9 @@ def smooth(
         gravity_world: [m/s^2], or where its estimate starts; None: unknown if "gravity" is estimated.
         offset_s: time offset, or where its estimate starts.
         knots_hz: knots a second; None: 20 beside an IMU (fewer beside a slow one), else one a pose.
+        drift: covariances (n, 6, 6) of what each pose but the first adds to an error that all later ones share,
+            over its right increment: as cameras are registered to a map that earlier ones made. None: errors
+            are independent.
 
     Returns:
         The posterior.
@@ -80,7 +85,7 @@ def smooth(
     >>> smooth(t, T, [0.01] * 3 + [0.002] * 3).covariance([1.0, 1.05]).shape
     (2, 6, 6)
     """
-    measured = _measured(times, T_world_cam, sigmas, imu, use, estimate, noise, offset_s)
+    measured = _measured(times, T_world_cam, sigmas, drift, imu, use, estimate, noise, offset_s)
     guess = _guess(measured, T_body_cam, gravity_world, offset_s)
     return _solved(measured, guess, fit_noise, knots_hz)
 
@@ -91,6 +96,7 @@ class _Measured(NamedTuple):
     t: Float[np.ndarray, " n"]
     T: Float[np.ndarray, "n 4 4"]
     root_information: Float[np.ndarray, "n 6 6"]
+    drift: Float[np.ndarray, "n 6 6"] | None
     imu: Imu | None
     used: Float[np.ndarray, "2"]
     noise: ImuNoise | None
@@ -106,7 +112,7 @@ class _Guess(NamedTuple):
     scale: float
 
 
-def _measured(times, T_world_cam, sigmas, imu, use, estimate, noise, offset_s: float) -> _Measured:
+def _measured(times, T_world_cam, sigmas, drift, imu, use, estimate, noise, offset_s: float) -> _Measured:
     t, T = checked_poses(times, T_world_cam)
     if len(t) < 2:
         raise ValueError("poses: expected at least two, got one")
@@ -119,7 +125,11 @@ def _measured(times, T_world_cam, sigmas, imu, use, estimate, noise, offset_s: f
         imu = _checked_readings(imu, t, offset_s)
     names = () if imu is None else tuple(name for name in QUANTITIES if name in estimate)
     used = np.array([imu is not None and name in use for name in SENSORS], np.float64)
-    return _Measured(t, T, _root_information(sigmas, len(t)), imu, used, noise, names)
+    root = _root_information(sigmas, len(t))
+    if drift is not None:
+        drift = np.asarray(drift, np.float64)
+        check_shapes(drift=(drift, f"{len(t)} 6 6"))
+    return _Measured(t, T, root, drift, imu, used, noise, names)
 
 
 def _guess(measured: _Measured, T_body_cam, gravity_world, offset_s: float) -> _Guess:
@@ -159,13 +169,14 @@ def _solved(measured: _Measured, guess: _Guess, fit_noise: bool, knots_hz: float
     metric = measured.T.copy()
     metric[:, :3, 3] *= guess.scale
     along_body = metric @ rigid.inverse(guess.T_body_cam)
+    ends = np.linspace(first, last, intervals // 3 + 1)  # of blocks
     control = control_poses_along((first, last), intervals, t, along_body)
     levels = first_levels(readings, measured.noise, imu, t, metric, fit_noise)
     with jax.enable_x64(True):
         f = lambda x: jnp.asarray(x, jnp.float64)
-        bias = np.zeros((intervals // 3 + 1, 6))
-        start = (control, bias, guess.gravity_world, guess.offset_s, guess.T_body_cam, np.log(guess.scale))
-        state = State(*map(f, start))
+        none = np.zeros((intervals // 3 + 1, 6))
+        sensors = (guess.gravity_world, guess.offset_s, guess.T_body_cam, np.log(guess.scale))
+        state = State(*map(f, (control, none, none, *sensors)))
         prior = jax.tree.map(jnp.asarray, _prior(measured.estimate, measured.noise))
         problem = Problem(
             interval_s=f((last - first) / intervals),
@@ -175,6 +186,7 @@ def _solved(measured: _Measured, guess: _Guess, fit_noise: bool, knots_hz: float
             t=f(measured.t - first),
             T=f(measured.T),
             root_information=f(measured.root_information),
+            root_drift=f(_root_drift(measured.drift, t, metric, ends)),
             start=state,
             prior=prior,
         )
@@ -183,6 +195,26 @@ def _solved(measured: _Measured, guess: _Guess, fit_noise: bool, knots_hz: float
         if fit_noise:
             at, level = calibrated(problem, at, level, usual)
         return posterior_of(problem, at, level, readings, clock_s=first, estimated=measured.estimate)
+
+
+def _root_drift(
+    drift: Float[np.ndarray, "n 6 6"] | None,
+    t: Float[np.ndarray, " n"],
+    T_world_cam: Float[np.ndarray, "n 4 4"],
+    ends: Float[np.ndarray, " m"],
+) -> Float[np.ndarray, "m-1 6 6"]:
+    """Roots of the information of the drift's step between times, over twists of the world.
+
+    What is added at a pose is spread evenly over the time since the last one.
+    """
+    if drift is None:
+        return np.tile(np.eye(6) / _NO_DRIFT, (len(ends) - 1, 1, 1))
+    to_world = rigid.adjoint(T_world_cam)
+    added = np.cumsum((to_world @ drift @ np.swapaxes(to_world, 1, 2))[1:], axis=0)
+    added = np.concatenate([np.zeros((1, 6, 6)), added]).reshape(len(t), 36)
+    total = np.stack([np.interp(ends, t, column) for column in added.T], axis=1).reshape(-1, 6, 6)
+    covariance = np.diff(total, axis=0) + _NO_DRIFT**2 * np.eye(6)
+    return np.linalg.inv(np.linalg.cholesky(covariance))
 
 
 def _prior(estimate: Sequence[str], noise: ImuNoise | None) -> Prior:

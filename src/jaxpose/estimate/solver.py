@@ -91,7 +91,7 @@ def spread(at: Linearisation) -> tuple[Factorisation, Covariance, GroupFit]:
     return factor, known, GroupFit(of(0), of(1))
 
 
-def pair_covariance(known: Covariance) -> Float[Array, "n 58 58"]:
+def pair_covariance(known: Covariance) -> Float[Array, "n 70 70"]:
     """The covariance of each pair of neighbouring blocks with the border."""
     early, late, beside = known.diagonal[:-1], known.diagonal[1:], known.lower
     border = jnp.concatenate([known.border[:-1], known.border[1:]], axis=1)

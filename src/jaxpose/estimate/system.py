@@ -1,9 +1,13 @@
 """The least-squares problem of a spline, its sensors and what they measured: residuals and their derivatives.
 
-Unknowns: the control poses (moved on their right), the biases of gyroscope and accelerometer at every third
-knot (linear between), and, where they are free, the direction of gravity, the time offset t_imu = t_pose +
-offset, the mounting T_body_cam and the scale of the poses. The spline is the body's, in metres, on the clock
-of the IMU. Three control poses and the bias of their knot are one block.
+Unknowns: the control poses (moved on their right); at every third knot (linear between) the biases of
+gyroscope and accelerometer, and the drift of measured poses; and, where they are free, the direction of
+gravity, the time offset t_imu = t_pose + offset, the mounting T_body_cam and the scale of the poses. The
+spline is the body's, in metres, on the clock of the IMU. Three control poses, the bias and the drift of their
+knot are one block.
+
+Poses that are registered to a map which earlier ones made share its errors: T_measured = exp(drift) T, where
+the drift walks, each step of it small beside the camera.
 """
 
 from typing import NamedTuple
@@ -19,10 +23,12 @@ from jaxpose.estimate.kinematics import Kinematics, Segment, basis, kinematics, 
 from jaxpose.geometry import se3
 from jaxpose.imu.types import AnyArray
 
-BLOCK = 24  # unknowns: three control poses, and the biases at the first one's knot
+BLOCK = 30  # unknowns: three control poses, and the biases and the drift at the first one's knot
+CONTROL, BIAS, DRIFT = slice(0, 18), slice(18, 24), slice(24, 30)
 BORDER = 10  # gravity's direction 2, time offset 1, mounting 6, logarithm of the scale 1
 GRAVITY, OFFSET, MOUNTING, SCALE = slice(0, 2), slice(2, 3), slice(3, 9), slice(9, 10)
 _PAIR = 2 * BLOCK  # what an interval's residuals depend on beside the border
+_FIXED = 1e-9  # [m, rad] sigma of the drift of the first pose, which the world's frame is that of
 _RIDGE = 1e-3  # share of a motion's likely smallness that holds beside readings, so that all is determined
 HUBER = 16.81  # squared distance of a pose from which it counts by its size: 99% of chi^2 with 6 degrees
 
@@ -32,6 +38,7 @@ class State(NamedTuple):
 
     control: Float[Array, "k 4 4"]  # T_world_body
     bias: Float[Array, "b 6"]  # gyroscope [rad/s], accelerometer [m/s^2], at every third knot
+    drift: Float[Array, "b 6"]  # [m, rad] of measured poses, a twist of the world, at every third knot
     gravity_world: Float[Array, "3"]  # [m/s^2], of known size
     offset_s: Float[Array, ""]  # t_imu - t_pose
     T_body_cam: Float[Array, "4 4"]
@@ -68,6 +75,7 @@ class Problem(NamedTuple):
     t: Float[Array, " p"]  # of poses
     T: Float[Array, "p 4 4"]  # T_world_cam as measured, positions in units of their own
     root_information: Float[Array, "p 6 6"]  # S with S^T S the inverse of the covariance
+    root_drift: Float[Array, "n 6 6"]  # the same of the drift's step over each block
     start: State  # what the border's prior is about
     prior: Prior
 
@@ -76,7 +84,7 @@ class Rows(NamedTuple):
     """Whitened residuals with their derivatives by a pair of blocks and the border."""
 
     residual: Float[Array, "*n"]
-    jacobian: Float[Array, "*n 58"]
+    jacobian: Float[Array, "*n 70"]
 
 
 class Residuals(NamedTuple):
@@ -87,6 +95,7 @@ class Residuals(NamedTuple):
     pair: Int[Array, " p"]  # that each pose depends on
     motion: Rows  # (pairs, 3, 6)
     walk: Rows  # (pairs, 6)
+    drift: Rows  # (pairs, 6)
 
 
 def residuals(problem: Problem, state: State, noise: Noise) -> Residuals:
@@ -100,10 +109,9 @@ def residuals(problem: Problem, state: State, noise: Noise) -> Residuals:
     at_nodes = jax.tree.map(lambda x: x[: count * NODES].reshape(count, NODES, *x.shape[1:]), at)
     at_poses = jax.tree.map(lambda x: x[count * NODES :], at)
     pose_rows, pair = _poses(problem, state, noise, index[count * NODES :], at_poses)
-    return Residuals(
-        _inertial(problem, state, noise, at_nodes), pose_rows, pair,
-        _motion(problem, noise, at_nodes), _walk(problem, state),
-    )  # fmt: skip
+    inertial, motion = _inertial(problem, state, noise, at_nodes), _motion(problem, noise, at_nodes)
+    drift = _steps(state.drift, problem.root_drift, DRIFT)
+    return Residuals(inertial, pose_rows, pair, motion, _walk(problem, state), drift)
 
 
 def _inertial(problem: Problem, state: State, noise: Noise, at: Kinematics) -> Rows:
@@ -114,7 +122,7 @@ def _inertial(problem: Problem, state: State, noise: Noise, at: Kinematics) -> R
     v, omega = at.twist[..., :3], at.twist[..., 3:]
     gravity = turned(state.gravity_world)
     force = at.twist_rate[..., :3] + jnp.cross(omega, v) - gravity
-    first, second = _bias_shares(intervals, state.bias.dtype)
+    first, second = _shares(intervals, state.bias.dtype)
     bias = state.bias.repeat(3, 0)
     bias = first * bias[:intervals, None] + second * bias[3 : intervals + 3, None]
     predicted = jnp.concatenate([omega, force], axis=-1) + bias
@@ -125,9 +133,9 @@ def _inertial(problem: Problem, state: State, noise: Noise, at: Kinematics) -> R
     J_gravity = jnp.einsum("nmji,jd->nmid", R, tilt * _free(problem)[None, GRAVITY])
     J_gravity = jnp.concatenate([jnp.zeros_like(J_gravity), J_gravity], axis=-2)
     one = jnp.eye(6, dtype=J.dtype)[None, None]
-    J_bias = jnp.broadcast_to(
-        jnp.concatenate([first[..., None] * one, second[..., None] * one], axis=-1), (*J.shape[:-1], 12)
-    )
+    zero = jnp.zeros_like(first)
+    J_bias = jnp.concatenate([x[..., None] * one for x in (first, zero, second, zero)], axis=-1)
+    J_bias = jnp.broadcast_to(J_bias, (*J.shape[:-1], 24))
     none = jnp.zeros((*J.shape[:-1], BORDER - 2), J.dtype)
     rows = _in_pairs(predicted, J, J_bias, jnp.concatenate([J_gravity, none], axis=-1))
     sigma = jnp.stack([noise.gyro, noise.accelerometer], axis=1)
@@ -147,18 +155,23 @@ def _motion(problem: Problem, noise: Noise, at: Kinematics) -> Rows:
     middle = jnp.asarray(lagrange(np.array([0.5]))[0], weight.dtype)
     r = jnp.einsum("m,nmi->ni", middle, at.twist_rate)[:, None] * weight
     J = jnp.einsum("m,nmij->nij", middle, at.rate_jacobian)[:, None] * weight[..., None]
-    rest = jnp.zeros((*J.shape[:-1], 12 + BORDER), J.dtype)
-    return _in_pairs(r, J, rest[..., :12], rest[..., 12:])
+    rest = jnp.zeros((*J.shape[:-1], 24 + BORDER), J.dtype)
+    return _in_pairs(r, J, rest[..., :24], rest[..., 24:])
 
 
 def _walk(problem: Problem, state: State) -> Rows:
     """From each bias to the next."""
     sigma = jnp.asarray(problem.prior.walk) * jnp.sqrt(3 * problem.interval_s)
-    J = jnp.zeros((6, _PAIR + BORDER), state.bias.dtype)
-    one = jnp.diag(1 / sigma)
-    J = J.at[:, 18:24].set(-one).at[:, 42:48].set(one)
-    r = (state.bias[1:] - state.bias[:-1]) / sigma[None]
-    return Rows(r, jnp.broadcast_to(J, (*r.shape, _PAIR + BORDER)))
+    weight = jnp.broadcast_to(jnp.diag(1 / sigma), (len(state.bias) - 1, 6, 6))
+    return _steps(state.bias, weight, BIAS)
+
+
+def _steps(values: Float[Array, "b 6"], weight: Float[Array, "n 6 6"], part: slice) -> Rows:
+    """The steps of values of blocks, of which they are a part, times weights."""
+    J = jnp.zeros((*weight.shape[:2], _PAIR + BORDER), values.dtype)
+    J = J.at[:, :, part].set(-weight)
+    J = J.at[:, :, BLOCK + part.start : BLOCK + part.stop].set(weight)
+    return Rows(jnp.einsum("nij,nj->ni", weight, values[1:] - values[:-1]), J)
 
 
 def _poses(
@@ -167,27 +180,34 @@ def _poses(
     """Camera poses: position in the measured camera's axes [its units], and rotation."""
     found, J = jax.vmap(_camera, (0, None))(at, state)
     shrunk = jnp.exp(-state.log_scale)
+    _, place = _where(problem, state, problem.t + state.offset_s)
+    pair = index // 3
+    late = (((index % 3).astype(place.dtype) + place) / 3)[:, None]
+    drift = (1 - late) * state.drift[pair] + late * state.drift[pair + 1]
 
-    def residual(increment, T, T_measured):
-        T = se3.compose(T, se3.exp(increment[:6]))
+    def residual(increment, drift, T, T_measured):
+        T = se3.compose(se3.exp(drift), se3.compose(T, se3.exp(increment[:6])))
         position = jnp.exp(-increment[6]) * shrunk * T[:3, 3] - T_measured[:3, 3]
         turn = se3.so3_log(T_measured[:3, :3].T @ T[:3, :3])
         return jnp.concatenate([T_measured[:3, :3].T @ position, turn])
 
     none = jnp.zeros(7, state.control.dtype)
-    r = jax.vmap(residual, (None, 0, 0))(none, found, problem.T)
-    dr = jax.vmap(jax.jacfwd(residual), (None, 0, 0))(none, found, problem.T)
-    J = dr[..., :6] @ J
-    J = jnp.concatenate([J[..., :-1], J[..., -1:] + dr[..., 6:]], axis=-1)
+    r = jax.vmap(residual, (None, 0, 0, 0))(none, drift, found, problem.T)
+    by_pose, by_drift = jax.vmap(jax.jacfwd(residual, (0, 1)), (None, 0, 0, 0))(none, drift, found, problem.T)
+    slope = (state.drift[pair + 1] - state.drift[pair]) / (3 * problem.interval_s)
+    J = by_pose[..., :6] @ J
+    J = J.at[..., 24 + OFFSET.start].add(jnp.einsum("pij,pj->pi", by_drift, slope))
+    J = jnp.concatenate([J[..., :-1], J[..., -1:] + by_pose[..., 6:]], axis=-1)
     J = jnp.concatenate([J[..., :24], J[..., 24:] * _free(problem)[None, None]], axis=-1)
     scale = jnp.repeat(jnp.stack([noise.position, noise.rotation]), 3)
     r = jnp.einsum("pij,pj->pi", problem.root_information, r / scale[None])
-    J = problem.root_information @ (J / scale[None, :, None])
+    J, by_drift = (problem.root_information @ (x / scale[None, :, None]) for x in (J, by_drift))
+    early, late = (share[..., None] * by_drift for share in (1 - late, late))
+    beside = jnp.concatenate([0 * early, early, 0 * late, late], axis=-1)
     far = jnp.maximum(jnp.sum(r * r, axis=-1), HUBER)
     root_weight = (HUBER / far) ** 0.25
-    phase = index % 3
-    placed = _placed(phase[:, None, None], J[..., :24], jnp.zeros((*J.shape[:-1], 12), J.dtype), J[..., 24:])
-    return Rows(r * root_weight[:, None], placed * root_weight[:, None, None]), index // 3
+    placed = _placed((index % 3)[:, None, None], J[..., :24], beside, J[..., 24:])
+    return Rows(r * root_weight[:, None], placed * root_weight[:, None, None]), pair
 
 
 def _where(
@@ -218,12 +238,12 @@ def _camera(at: Kinematics, state: State) -> tuple[Float[Array, "4 4"], Float[Ar
 
 def camera_rows(
     problem: Problem, state: State, t: Float[Array, " p"]
-) -> tuple[Float[Array, "p 4 4"], Float[Array, "p 6 58"], Int[Array, " p"]]:
+) -> tuple[Float[Array, "p 4 4"], Float[Array, "p 6 70"], Int[Array, " p"]]:
     """Camera poses at times of the poses' clock, and their increments' derivatives by a pair of blocks."""
     index, place = _where(problem, state, t + state.offset_s)
     at = along(problem, segments(state.control), index, place)
     T, J = jax.vmap(_camera, (0, None))(at, state)
-    none = jnp.zeros((*J.shape[:-1], 12), J.dtype)
+    none = jnp.zeros((*J.shape[:-1], 24), J.dtype)
     placed = _placed((index % 3)[:, None, None], J[..., :24], none, J[..., 24:] * _free(problem)[None, None])
     return T, placed, index // 3
 
@@ -233,7 +253,7 @@ def normal_equations(problem: Problem, state: State, found: Residuals) -> tuple[
     pairs = state.bias.shape[0] - 1
     H = jnp.zeros((pairs, _PAIR + BORDER, _PAIR + BORDER), state.control.dtype)
     side = jnp.zeros(H.shape[:2], H.dtype)
-    for rows in (found.inertial, found.motion, found.walk):
+    for rows in (found.inertial, found.motion, found.walk, found.drift):
         J, r = rows.jacobian.reshape(pairs, -1, H.shape[1]), rows.residual.reshape(pairs, -1)
         H, side = H + jnp.swapaxes(J, 1, 2) @ J, side - jnp.einsum("nri,nr->ni", J, r)
     J, r = found.poses.jacobian, found.poses.residual
@@ -246,30 +266,32 @@ def normal_equations(problem: Problem, state: State, found: Residuals) -> tuple[
     row = joined(side[:, :BLOCK], side[:, BLOCK:_PAIR])
     corner, corner_side = H[:, _PAIR:, _PAIR:].sum(0), side[:, _PAIR:].sum(0)
     prior = problem.prior
-    information = 1 / prior.bias**2
-    diagonal = diagonal.at[0, 18:, 18:].add(jnp.diag(information))
-    row = row.at[0, 18:].add(-information * state.bias[0])
+    information = 1 / jnp.concatenate([jnp.asarray(prior.bias), jnp.full(6, _FIXED, H.dtype)]) ** 2
+    first = jnp.concatenate([state.bias[0], state.drift[0]])
+    diagonal = diagonal.at[0, BIAS.start :, BIAS.start :].add(jnp.diag(information))
+    row = row.at[0, BIAS.start :].add(-information * first)
     away = border_difference(state, problem.start)
     corner_information = 1 / prior.border**2
     corner += jnp.diag(jnp.where(prior.free, corner_information, 1))
     corner_side -= jnp.where(prior.free, corner_information * away, 0)
     blocks = Blocks(diagonal, H[:, BLOCK:_PAIR, :BLOCK], border, corner, row, corner_side)
-    cost = sum(jnp.sum(rows.residual**2) for rows in (found.inertial, found.motion, found.walk))
+    cost = sum(jnp.sum(rows.residual**2) for rows in (found.inertial, found.motion, found.walk, found.drift))
     pose_square = jnp.sum(found.poses.residual**2, axis=-1)  # already times the weight
     far = pose_square**2 / HUBER  # the unweighted square where it is beyond
     cost += jnp.sum(jnp.where(far > HUBER, 2 * jnp.sqrt(HUBER * far) - HUBER, pose_square))
-    cost += jnp.sum(information * state.bias[0] ** 2) + jnp.sum(_free(problem) * corner_information * away**2)
+    cost += jnp.sum(information * first**2) + jnp.sum(_free(problem) * corner_information * away**2)
     return blocks, cost / 2
 
 
-def retract(state: State, row: Float[Array, "b 24"], corner: Float[Array, "10"]) -> State:
+def retract(state: State, row: Float[Array, "b 30"], corner: Float[Array, "10"]) -> State:
     """The state that increments of the unknowns lead to."""
-    step = row[:, :18].reshape(-1, 6)
+    step = row[:, CONTROL].reshape(-1, 6)
     g = state.gravity_world
     turn = se3.so3_exp(tangent(g) @ corner[GRAVITY])
     return State(
         se3.compose(state.control, se3.exp(step)),
-        state.bias + row[:, 18:],
+        state.bias + row[:, BIAS],
+        state.drift + row[:, DRIFT],
         turn @ g,
         state.offset_s + corner[OFFSET][0],
         se3.compose(state.T_body_cam, se3.exp(corner[MOUNTING])),
@@ -296,7 +318,7 @@ def tangent(g: Float[Array, "3"]) -> Float[Array, "3 2"]:
     return jnp.stack([first, jnp.cross(g, first) / jnp.linalg.norm(g)], axis=1)
 
 
-def _bias_shares(intervals: int, dtype) -> tuple[Float[np.ndarray, "n m 1"], Float[np.ndarray, "n m 1"]]:
+def _shares(intervals: int, dtype) -> tuple[Float[np.ndarray, "n m 1"], Float[np.ndarray, "n m 1"]]:
     second = ((np.arange(intervals) % 3)[:, None] + PLACES)[..., None] / 3
     return np.asarray(1 - second, dtype), np.asarray(second, dtype)
 
@@ -305,19 +327,19 @@ def _free(problem: Problem) -> Float[Array, "10"]:
     return jnp.asarray(problem.prior.free, problem.interval_s.dtype)
 
 
-def _in_pairs(r, J_control, J_bias, J_border) -> Rows:
+def _in_pairs(r, J_control, J_beside, J_border) -> Rows:
     """Rows of every interval (n, m, 6) as rows of pairs of blocks (n / 3, 3 m, 6)."""
     rows = r.shape[1]
     three = lambda x: x.reshape(-1, 3 * rows, *x.shape[2:])
     phase = jnp.repeat(jnp.arange(3), rows)[None, :, None, None]
-    return Rows(three(r), _placed(phase, *(three(x) for x in (J_control, J_bias, J_border))))
+    return Rows(three(r), _placed(phase, *(three(x) for x in (J_control, J_beside, J_border))))
 
 
-def _placed(phase, control, bias, border):
-    """Derivatives by control poses `phase` to `phase` + 3, and by two biases, in the order of two blocks."""
+def _placed(phase, control, beside, border):
+    """Derivatives by control poses `phase` to `phase` + 3, and by the rest of two blocks, in their order."""
     four = jnp.split(control, 4, axis=-1)
     zero = jnp.zeros_like(four[0])
-    early, late = jnp.split(bias, 2, axis=-1)
+    early, late = jnp.split(beside, 2, axis=-1)
     places = []
     for k in range(6):
         options = [four[k - p] if 0 <= k - p < 4 else zero for p in range(3)]
