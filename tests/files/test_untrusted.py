@@ -245,6 +245,9 @@ def test_names_stay_in_their_folder(name):
     with pytest.raises(DataError, match="f: expected a file name that stays in its folder, got"):
         schema.name_inside("f", name)
     assert schema.name_inside("f", "images/a..b.png") == "images/a..b.png"
+    assert schema.name_inside("f", f"images/{'a' * 251}.png")
+    with pytest.raises(DataError, match="f: expected file names of up to 255 bytes, got 260"):
+        schema.name_inside("f", f"images/{'ä' * 128}.png")
 
 
 @pytest.mark.parametrize(

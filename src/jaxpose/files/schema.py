@@ -151,6 +151,9 @@ def rigid_transforms(path: Path | str, key: str, T: Float[np.ndarray, "n 4 4"]) 
         )
 
 
+_LONGEST_NAME = 255  # bytes, in any file system
+
+
 def name_inside(path: Path | str, name: str) -> str:
     """A file name that leads nowhere but into the folder it is of.
 
@@ -162,11 +165,14 @@ def name_inside(path: Path | str, name: str) -> str:
         The name.
 
     Raises:
-        DataError: for an absolute one, and for one with `..` in it.
+        DataError: for an absolute one, one with `..` in it, and one that no file system holds.
     """
     leads_up = ".." in name and ".." in name.replace("\\", "/").split("/")
     if not name or "\0" in name or name.startswith(("/", "\\")) or leads_up:
         raise DataError(f"{path}: expected a file name that stays in its folder, got {name!r:.60}")
+    longest = max(len(part.encode("utf-8", "surrogatepass")) for part in name.split("/"))
+    if longest > _LONGEST_NAME:
+        raise DataError(f"{path}: expected file names of up to {_LONGEST_NAME} bytes, got {longest}")
     return name
 
 

@@ -204,6 +204,9 @@ def test_aedat4_by_its_makers_writer(tmp_path):
             assert len(registry.load_events(file).events.t) < 5000
         except DataError as error:
             assert "a.aedat4: expected" in str(error) and "\n" not in str(error)
+    file.write_bytes(content.replace(b"</node>", b"</nodf>", 1))
+    with pytest.raises(DataError, match="a.aedat4: expected an AEDAT 4 file, got mismatched tag"):
+        registry.load_events(file)
 
 
 @pytest.mark.skipif(importlib.util.find_spec("event_stream") is None, reason="the format's own package")

@@ -4,6 +4,7 @@ import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from xml.etree import ElementTree
 
 from jaxpose.datasets.events.stream import Block, Stream
 from jaxpose.errors import DataError
@@ -14,7 +15,7 @@ MAGIC = b"#!AER-DAT4.0"
 def aedat4_stream(file: Path) -> Stream:
     """The events of an AEDAT 4 file, of its first stream of them; timestamps are microseconds since 1970."""
     with _panics_named(file):
-        _check_lengths(file)
+        _check(file)
         found = _decoder(file).id_to_stream()
     streams = {number: about for number, about in found.items() if about["type"] == "events"}
     if not streams:
@@ -62,8 +63,11 @@ def _panics_named(file: Path) -> Iterator[None]:
         raise DataError(f"{file}: expected an AEDAT 4 file, got {words}") from None
 
 
-def _check_lengths(file: Path) -> None:
-    """ValueError for a packet that is longer than the file: the package allots what a packet asks for."""
+def _check(file: Path) -> None:
+    """An error for what ends the package, or the whole process: it allots what a packet asks for.
+
+    ValueError for a packet that is longer than the file, ParseError for streams that are no XML.
+    """
     end = file.stat().st_size
     with file.open("rb") as stream:
         stream.seek(len(MAGIC) + len("\r\n"))
@@ -74,10 +78,14 @@ def _check_lengths(file: Path) -> None:
         # FlatBuffers: the table, its vtable, and of that the second entry, where the table of packets begins.
         (table,) = struct.unpack_from("<I", header)
         (back,) = struct.unpack_from("<i", header, table)
-        size, _, _, place = struct.unpack_from("<4H", header + bytes(8), table - back)
+        size, _, _, place, about = struct.unpack_from("<5H", header + bytes(10), table - back)
         if size >= 8 and place:
             (packets_end,) = struct.unpack_from("<q", header, table + place)
             end = packets_end if 0 <= packets_end < end else end
+        if size >= 10 and about:  # the streams, as text
+            (text,) = struct.unpack_from("<I", header, table + about)
+            (count,) = struct.unpack_from("<I", header, table + about + text)
+            ElementTree.fromstring(header[table + about + text + 4 :][:count])
         while (at := stream.tell()) + 8 <= end:
             _, length = struct.unpack("<iI", stream.read(8))
             if length > end - at - 8:
