@@ -193,3 +193,40 @@ def test_what_the_motion_does_not_show_is_not_invented():
     s = found.sensors
     assert s.offset_sigma_s > 0.1 and s.T_body_cam_sigma[:3].min() > 0.1
     assert set(found.unobserved) >= {"offset", "extrinsics"}
+
+
+def drifting(seed):
+    """Poses at 5 Hz whose error is 5 mm and 0.1 degrees of their own, and a walk of the same steps."""
+    rng = np.random.default_rng([seed, 5])
+    t = np.arange(0.0, DURATION_S, 0.2)
+    truth, noisy = hand_held.cameras(t, rng, MOUNTING, OWN[:3], OWN[3:])
+    steps = rng.normal(size=(len(t), 6)) * OWN
+    shared = np.eye(4)
+    for i in range(1, len(t)):
+        shared = shared @ truth[i] @ rigid.exp(steps[i]) @ rigid.inverse(truth[i])  # beside the camera then
+        noisy[i] = shared @ noisy[i]
+    return t, truth, noisy, hand_held.readings(DURATION_S, 200.0, rng, GYRO_BIAS, ACCELEROMETER_BIAS)
+
+
+OWN = np.repeat([0.005, np.radians(0.1)], 3)
+
+
+@pytest.mark.slow
+def test_an_error_that_poses_share_is_stated():
+    """Squared errors of moves of 10 s are in the 95% band of 20 runs; as independent they are far off."""
+    own, squares = np.diag(OWN**2), []
+    for seed in range(20):
+        t, truth, noisy, imu = drifting(seed)
+        covariances = np.tile(own, (len(t), 1, 1))
+        for drift in (covariances, None):
+            found = smooth(
+                t, noisy, covariances, imu, drift=drift, noise=hand_held.SHEET, T_body_cam=MOUNTING
+            )
+            moved = lambda T: rigid.inverse(T[5]) @ T[55]
+            error = rigid.log(rigid.inverse(moved(found.pose(t))) @ moved(truth))
+            squares.append(error @ np.linalg.solve(found.relative_covariance(t[5], t[55])[0], error))
+            if drift is not None:
+                assert 0.7 < found.noise.position < 1.4 and 0.7 < found.noise.rotation < 1.4
+    low, high = chi2.ppf([0.025, 0.975], 6 * 20) / 20
+    assert low < np.mean(squares[::2]) < high, (low, np.mean(squares[::2]), high)
+    assert np.mean(squares[1::2]) > 10 * high

@@ -78,7 +78,7 @@ def test_lost_frames_lead_to_where_the_camera_is_found():
 def test_of_two_poses_that_fit_the_surfaces_colour_decides():
     found = Tracked(
         np.eye(4), None, 1.0, 1.0, colour_error=0.1, exposure=np.ones(3), valid=0.9, iterations=5, sigma=0.0,
-        information=np.zeros((6, 6)), line_delay=np.zeros(2),
+        covariance=np.eye(6), information=np.zeros((6, 6)), line_delay=np.zeros(2),
     )  # fmt: skip
     better = found._replace(colour_error=0.03)
     assert _looks_better(POLICY, better, found) and not _looks_better(POLICY, found, better)
@@ -127,7 +127,7 @@ def test_features_of_another_place_are_given_up_where_colours_speak_against_them
         T = predicted.T_ref_body[-1]
         colour = 0.05 if np.linalg.norm(T[:3, 3]) > 1 else colour_there
         few = {"valid": 0.9, "iterations": 5, "sigma": np.zeros(2), "exposure": np.ones(3)}
-        unknown = {"information": np.eye(6), "line_delay": np.zeros(2)}
+        unknown = {"covariance": np.eye(6), "information": np.eye(6), "line_delay": np.zeros(2)}
         return Tracked(T, None, 0.5, 0.01, colour_error=colour, **few, **unknown)
 
     monkeypatch.setattr(tracker, "seen_pose", lambda *_: FeaturePose(off, 1e-5 * np.eye(6), 50))

@@ -137,10 +137,7 @@ class Posterior(NamedTuple):
 
     def covariances(self) -> Covariances:
         """Covariances of poses and of moves of one second, 20 times a second, as `fields.save` takes them."""
-        first, last = self.span
-        t = first + np.arange(int((last - first) * _TABLE_HZ) + 1) / _TABLE_HZ
-        t = t if last - t[-1] < 1e-9 else np.append(t, last)
-        early = t[t + 1.0 <= last]
+        t, early = table_times(self.span)
         second = self.relative_covariance(early, early + 1.0) if len(early) else np.zeros((0, 6, 6))
         return Covariances(t, self.covariance(t), second)
 
@@ -164,6 +161,14 @@ class Posterior(NamedTuple):
         with jax.enable_x64(True):
             rows = _camera_rows(self.problem, self.state, jnp.asarray(t - self.clock_s))
         return tuple(np.asarray(x) for x in rows)
+
+
+def table_times(span: Span) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " k"]]:
+    """Times [s] of a table of covariances over a span, and those of them that have a second after them."""
+    first, last = span
+    t = first + np.arange(int((last - first) * _TABLE_HZ) + 1) / _TABLE_HZ
+    t = t if last - t[-1] < 1e-9 else np.append(t, last)
+    return t, t[t + 1.0 <= last]
 
 
 _camera_rows = jax.jit(camera_rows)

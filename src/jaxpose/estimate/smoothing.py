@@ -70,9 +70,9 @@ def smooth(
         gravity_world: [m/s^2], or where its estimate starts; None: unknown if "gravity" is estimated.
         offset_s: time offset, or where its estimate starts.
         knots_hz: knots a second; None: 20 beside an IMU (fewer beside a slow one), else one a pose.
-        drift: covariances (n, 6, 6) of what each pose but the first adds to an error that all later ones share,
-            over its right increment: as cameras are registered to a map that earlier ones made. None: errors
-            are independent.
+        drift: covariances (n, 6, 6) of what each pose but the first adds to an error that all later ones
+            share, over its right increment: as cameras are registered to a map that earlier ones made. None:
+            errors are independent.
 
     Returns:
         The posterior.
@@ -170,6 +170,7 @@ def _solved(measured: _Measured, guess: _Guess, fit_noise: bool, knots_hz: float
     metric[:, :3, 3] *= guess.scale
     along_body = metric @ rigid.inverse(guess.T_body_cam)
     ends = np.linspace(first, last, intervals // 3 + 1)  # of blocks
+    root_drift, to_camera = _drift_steps(measured.drift, t, metric, ends)
     control = control_poses_along((first, last), intervals, t, along_body)
     levels = first_levels(readings, measured.noise, imu, t, metric, fit_noise)
     with jax.enable_x64(True):
@@ -186,7 +187,8 @@ def _solved(measured: _Measured, guess: _Guess, fit_noise: bool, knots_hz: float
             t=f(measured.t - first),
             T=f(measured.T),
             root_information=f(measured.root_information),
-            root_drift=f(_root_drift(measured.drift, t, metric, ends)),
+            root_drift=f(root_drift),
+            to_camera=f(to_camera),
             start=state,
             prior=prior,
         )
@@ -197,24 +199,29 @@ def _solved(measured: _Measured, guess: _Guess, fit_noise: bool, knots_hz: float
         return posterior_of(problem, at, level, readings, clock_s=first, estimated=measured.estimate)
 
 
-def _root_drift(
+def _drift_steps(
     drift: Float[np.ndarray, "n 6 6"] | None,
     t: Float[np.ndarray, " n"],
     T_world_cam: Float[np.ndarray, "n 4 4"],
     ends: Float[np.ndarray, " m"],
-) -> Float[np.ndarray, "m-1 6 6"]:
-    """Roots of the information of the drift's step between times, over twists of the world.
+) -> tuple[Float[np.ndarray, "m-1 6 6"], Float[np.ndarray, "m-1 6 6"]]:
+    """Roots of the information of the drift's steps between times, in the axes of the camera after each.
 
     What is added at a pose is spread evenly over the time since the last one.
+
+    Returns:
+        The roots, and what brings twists of the world to those axes.
     """
-    if drift is None:
-        return np.tile(np.eye(6) / _NO_DRIFT, (len(ends) - 1, 1, 1))
     to_world = rigid.adjoint(T_world_cam)
+    after = np.clip(np.searchsorted(t, ends[1:]), 0, len(t) - 1)
+    to_camera = np.linalg.inv(to_world[after])
+    if drift is None:
+        return np.tile(np.eye(6) / _NO_DRIFT, (len(after), 1, 1)), to_camera
     added = np.cumsum((to_world @ drift @ np.swapaxes(to_world, 1, 2))[1:], axis=0)
     added = np.concatenate([np.zeros((1, 6, 6)), added]).reshape(len(t), 36)
     total = np.stack([np.interp(ends, t, column) for column in added.T], axis=1).reshape(-1, 6, 6)
-    covariance = np.diff(total, axis=0) + _NO_DRIFT**2 * np.eye(6)
-    return np.linalg.inv(np.linalg.cholesky(covariance))
+    covariance = to_camera @ np.diff(total, axis=0) @ np.swapaxes(to_camera, 1, 2) + _NO_DRIFT**2 * np.eye(6)
+    return np.linalg.inv(np.linalg.cholesky(covariance)), to_camera
 
 
 def _prior(estimate: Sequence[str], noise: ImuNoise | None) -> Prior:

@@ -79,15 +79,16 @@ def spread(at: Linearisation) -> tuple[Factorisation, Covariance, GroupFit]:
     known = covariance(factor)
     P = pair_covariance(known)
     explained = lambda J, P: jnp.einsum("...ij,...jk,...ik->...i", J, P, J)
+    inertial, poses, drift, motion = at.found.inertial, at.found.poses, at.found.drift, at.found.motion
     sums = []
-    for rows, P_rows in ((at.found.inertial, P), (at.found.motion, P), (at.found.poses, P[at.found.pair])):
+    for rows, P_rows in ((inertial, P), (motion, P), (poses, P[at.found.pair]), (drift, P)):
         per_pair = rows.jacobian.reshape(len(P_rows), -1, P.shape[-1])
         used = explained(per_pair, P_rows).reshape(rows.residual.shape)
         counted = jnp.any(rows.jacobian != 0, axis=-1)
         both = jnp.stack([rows.residual**2, jnp.where(counted, 1 - used, 0)])
         sums.append(both.reshape(2, -1, *both.shape[-2:-1], 2, 3).sum((1, -1)))
-    inertial, motion, poses = sums[0], sums[1].sum(1), sums[2].sum(1)
-    of = lambda k: Noise(inertial[k, :, 0], inertial[k, :, 1], *poses[k], *motion[k])
+    bands, moved, posed = sums[0], sums[1].sum(1), sums[2].sum(1) + sums[3].sum(1)
+    of = lambda k: Noise(bands[k, :, 0], bands[k, :, 1], *posed[k], *moved[k])
     return factor, known, GroupFit(of(0), of(1))
 
 

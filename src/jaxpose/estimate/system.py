@@ -75,7 +75,8 @@ class Problem(NamedTuple):
     t: Float[Array, " p"]  # of poses
     T: Float[Array, "p 4 4"]  # T_world_cam as measured, positions in units of their own
     root_information: Float[Array, "p 6 6"]  # S with S^T S the inverse of the covariance
-    root_drift: Float[Array, "n 6 6"]  # the same of the drift's step over each block
+    root_drift: Float[Array, "n 6 6"]  # the same of the drift's step over each block, in the axes of a camera
+    to_camera: Float[Array, "n 6 6"]  # which twists of the world are brought to by these
     start: State  # what the border's prior is about
     prior: Prior
 
@@ -110,7 +111,8 @@ def residuals(problem: Problem, state: State, noise: Noise) -> Residuals:
     at_poses = jax.tree.map(lambda x: x[count * NODES :], at)
     pose_rows, pair = _poses(problem, state, noise, index[count * NODES :], at_poses)
     inertial, motion = _inertial(problem, state, noise, at_nodes), _motion(problem, noise, at_nodes)
-    drift = _steps(state.drift, problem.root_drift, DRIFT)
+    to_camera = problem.to_camera / _pose_scale(noise)[None, :, None]
+    drift = _steps(state.drift, problem.root_drift @ to_camera, DRIFT)
     return Residuals(inertial, pose_rows, pair, motion, _walk(problem, state), drift)
 
 
@@ -199,7 +201,7 @@ def _poses(
     J = J.at[..., 24 + OFFSET.start].add(jnp.einsum("pij,pj->pi", by_drift, slope))
     J = jnp.concatenate([J[..., :-1], J[..., -1:] + by_pose[..., 6:]], axis=-1)
     J = jnp.concatenate([J[..., :24], J[..., 24:] * _free(problem)[None, None]], axis=-1)
-    scale = jnp.repeat(jnp.stack([noise.position, noise.rotation]), 3)
+    scale = _pose_scale(noise)
     r = jnp.einsum("pij,pj->pi", problem.root_information, r / scale[None])
     J, by_drift = (problem.root_information @ (x / scale[None, :, None]) for x in (J, by_drift))
     early, late = (share[..., None] * by_drift for share in (1 - late, late))
@@ -208,6 +210,11 @@ def _poses(
     root_weight = (HUBER / far) ** 0.25
     placed = _placed((index % 3)[:, None, None], J[..., :24], beside, J[..., 24:])
     return Rows(r * root_weight[:, None], placed * root_weight[:, None, None]), pair
+
+
+def _pose_scale(noise: Noise) -> Float[Array, "6"]:
+    """What the stated sigmas of poses, and of their drift, are multiplied by."""
+    return jnp.repeat(jnp.stack([noise.position, noise.rotation]), 3)
 
 
 def _where(

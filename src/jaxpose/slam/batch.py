@@ -1,18 +1,25 @@
-"""The end of a run: one continuous trajectory, by tracked poses and all readings at once."""
+"""The end of a run: one continuous trajectory, by tracked poses and all readings at once, and how sure it is.
 
+A registered pose has two errors: its own beside the map (`Tracked.covariance`), and the map's, to which it
+adds its own with what is mapped from it, so that the map's walks.
+"""
+
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxpose.estimate import Posterior, smooth
-from jaxpose.fields import Params, PoseField, bspline, fit
+from jaxpose.estimate.posterior import table_times
+from jaxpose.fields import Covariances, Params, PoseField, bspline, fit
 from jaxpose.geometry import rigid
 from jaxpose.imu import Imu
 from jaxpose.slam.types import Frames, SlamState, TrackingStatus
 
 _FEWEST = 4  # poses that an estimate can be made of
 _UNKNOWN = 1.0  # [m, rad] sigma of a pose that ends the run and is in doubt
+_ALIKE = 4  # registered frames to either side whose covariances are averaged: that of one is of 16 numbers
 
 
 class FinalTrajectory(NamedTuple):
@@ -24,6 +31,7 @@ class FinalTrajectory(NamedTuple):
     field_rmse_m: float  # of the field at the frames' times to the tracked poses
     field_rmse_deg: float
     posterior: Posterior | None
+    covariances: Covariances | None  # of it; None where a PoseNet tracked, and of too few registered frames
 
 
 def final_trajectory(state: SlamState, imu: Imu | None) -> FinalTrajectory:
@@ -39,61 +47,128 @@ def final_trajectory(state: SlamState, imu: Imu | None) -> FinalTrajectory:
     Returns:
         The trajectory.
     """
-    frames, posterior = state.frames, estimate_trajectory(state, imu)
+    frames = state.frames
+    posterior, by_images = estimate_trajectory(state, imu)
     tracked, t = frames.T_world_body @ state.T_body_cam, frames.t - frames.t[0]
     if posterior is None:
         intervals = max(round(t[-1] / float(np.median(np.diff(t)))), 1)
         fitted = fit(bspline((0.0, float(t[-1])), intervals), t, tracked)
-        off = fitted.translation_rmse_m, fitted.rotation_rmse_deg
-        return FinalTrajectory(tracked, fitted.field, fitted.params, *off, None)
+        off_m, off_deg = fitted.translation_rmse_m, fitted.rotation_rmse_deg
+        return FinalTrajectory(tracked, fitted.field, fitted.params, off_m, off_deg, None, by_images)
     T_world_cam = posterior.pose(t)
     turned = np.degrees(rigid.rotation_angle(T_world_cam[:, :3, :3], tracked[:, :3, :3]))
     moved = np.linalg.norm(T_world_cam[:, :3, 3] - tracked[:, :3, 3], axis=1)
-    moved_rms, turned_rms = (float(np.sqrt(np.mean(x**2))) for x in (moved, turned))
-    return FinalTrajectory(T_world_cam, *posterior.field(), moved_rms, turned_rms, posterior)
+    off_m, off_deg = (float(np.sqrt(np.mean(x**2))) for x in (moved, turned))
+    known = posterior.covariances() if by_images is None else by_images
+    return FinalTrajectory(T_world_cam, *posterior.field(), off_m, off_deg, posterior, known)
 
 
-def estimate_trajectory(state: SlamState, imu: Imu | None) -> Posterior | None:
+def estimate_trajectory(state: SlamState, imu: Imu | None) -> tuple[Posterior | None, Covariances | None]:
     """The trajectory that poses and readings together make most likely, on the clock of the first frame.
 
-    Frames that were not registered say nothing: the readings bridge them.
+    Frames that were not registered say nothing: the readings bridge them. Both sensors together take the
+    map's drift off, unless they contradict the poses by more than these say of themselves. Then, as with one
+    of them alone, they only lead from one frame to the next, and the images say how sure the trajectory is.
 
     Args:
         state: a run.
         imu: all readings, on the clock of the frames.
 
     Returns:
-        The posterior; None without readings that the run uses, with too few registered frames, and where a
-        PoseNet tracks (Ma et al.'s own way, whose trajectory is a fit to its poses).
+        The posterior: None without readings that the run uses, with too few registered frames, and where a
+        PoseNet tracks (Ma et al.'s own way, whose trajectory is a fit to its poses). And covariances by the
+        images: None where the posterior's are right, and where nothing is known.
     """
     config, frames = state.config, state.frames
-    if imu is None or not config.uses_gyroscope or config.uses_field:
-        return None
-    sigma = registered_sigmas(frames)
-    kept = np.isfinite(sigma).all(axis=1)
-    if kept.sum() < _FEWEST:
-        return None
-    t0, T_world_cam = frames.t[0], frames.T_world_body @ state.T_body_cam
+    own = own_covariances(frames)
+    kept = np.isfinite(own).all(axis=(1, 2))
+    if config.uses_field or kept.sum() < _FEWEST:
+        return None, None
+    own, t, T_world_cam = (
+        own[kept],
+        frames.t[kept] - frames.t[0],
+        frames.T_world_body[kept] @ state.T_body_cam,
+    )
+    if imu is None or not config.uses_gyroscope:
+        return None, tracked_covariances(t, T_world_cam, own)
     use = {"accelerometer": ("accelerometer",), "combined": ("gyroscope", "accelerometer")}
-    return smooth(
-        frames.t[kept] - t0,
-        T_world_cam[kept],
-        np.repeat(sigma[kept], 3, axis=1),
-        imu._replace(t=np.asarray(imu.t, np.float64) - t0),
+    estimated = partial(
+        smooth,
+        t,
+        T_world_cam,
+        own,
+        imu._replace(t=np.asarray(imu.t, np.float64) - frames.t[0]),
         use=use.get(config.imu, ("gyroscope",)),
         estimate=("biases", "gravity", *(x for x in config.estimate if x != "line-delay")),
         noise=config.imu_noise,
         T_body_cam=state.T_body_cam,
         gravity_world=state.gravity_world,
     )
+    if config.imu == "combined":
+        posterior = estimated(drift=own)
+        if max(posterior.noise.position, posterior.noise.rotation) < 1:
+            return posterior, None
+    return estimated(), tracked_covariances(t, T_world_cam, own)
 
 
-def registered_sigmas(frames: Frames) -> Float[np.ndarray, "n 2"]:
-    """One sigma (n, 2) of position [m] and rotation [rad] of the registered frames, NaN of the others."""
-    registered = (frames.status <= TrackingStatus.WEAK) & np.isfinite(frames.sigma).all(axis=1)
-    sigma = np.where(registered[:, None], frames.sigma, np.nan)
-    if registered.any():
-        sigma[0] = np.median(sigma[registered], axis=0)  # the first pose is as it was told
-    if np.isnan(sigma[-1]).any():
-        sigma[-1] = _UNKNOWN
-    return sigma
+def own_covariances(frames: Frames) -> Float[np.ndarray, "n 6 6"]:
+    """Covariances (n, 6, 6) of the registered frames beside the map, NaN of the others.
+
+    Over right increments of the camera; that of each frame is the mean of those around it.
+    """
+    registered = (frames.status <= TrackingStatus.WEAK) & np.isfinite(frames.covariance).all(axis=(1, 2))
+    found = np.full((frames.count, 6, 6), np.nan)
+    measured, index = frames.covariance[registered], np.flatnonzero(registered)
+    for k, i in enumerate(index):
+        found[i] = measured[max(k - _ALIKE, 0) : k + _ALIKE + 1].mean(axis=0)
+    if len(index):
+        found[0] = found[index[0]]  # the first pose is as it was told, and the map is made from it
+        if np.isnan(found[-1]).any():
+            found[-1] = _UNKNOWN**2 * np.eye(6)
+    return found
+
+
+def tracked_covariances(
+    t: Float[np.ndarray, " n"], T_world_cam: Float[np.ndarray, "n 4 4"], own: Float[np.ndarray, "n 6 6"]
+) -> Covariances:
+    """How sure a trajectory through tracked poses is, at them and between.
+
+    Between frames the motion is one whose acceleration is white noise, as strong as it looks at the frames:
+    there the middle of an interval dt is sqrt(q dt^3 / 96) off (integrated Wiener process, positions known at
+    the ends and beyond).
+
+    Args:
+        t: times of the poses [s].
+        T_world_cam: the poses.
+        own: covariance of each beside the map.
+
+    Returns:
+        Covariances of poses, and of moves of one second.
+    """
+    to_world = rigid.adjoint(T_world_cam)
+    added = np.cumsum((to_world @ own @ np.swapaxes(to_world, 1, 2))[1:], axis=0)
+    added = np.concatenate([np.zeros((1, 6, 6)), added])
+    step, dt = rigid.log(rigid.inverse(T_world_cam[:-1]) @ T_world_cam[1:]), np.diff(t)
+    change = (step[1:] / dt[1:, None] - step[:-1] / dt[:-1, None]) / ((dt[1:] + dt[:-1]) / 2)[:, None]
+    density = (
+        np.mean(change**2 * dt[1:, None], axis=0) * 1.5
+    )  # a second difference averages over two intervals
+
+    def at(times):
+        i = np.clip(np.searchsorted(t, times, side="right") - 1, 0, len(t) - 2)
+        u = ((times - t[i]) / dt[i])[:, None]
+        T = T_world_cam[i] @ rigid.exp(u * step[i])
+        between = lambda x: (1 - u[..., None]) * x[i] + u[..., None] * x[i + 1]
+        bridged = density * (dt[i, None] ** 3 * (u * (1 - u)) ** 2 / 6)
+        return T, between(added), between(own) + bridged[:, :, None] * np.eye(6)
+
+    def carried(T, covariance):
+        by = rigid.adjoint(T)
+        return by @ covariance @ np.swapaxes(by, 1, 2)
+
+    times, early = table_times((float(t[0]), float(t[-1])))
+    T, shared, alone = at(times)
+    (T_a, shared_a, alone_a), (T_b, shared_b, alone_b) = at(early), at(early + 1.0)
+    T_b_world = rigid.inverse(T_b)
+    moved = carried(T_b_world, shared_b - shared_a) + alone_b + carried(T_b_world @ T_a, alone_a)
+    return Covariances(times, carried(rigid.inverse(T), shared) + alone, moved)

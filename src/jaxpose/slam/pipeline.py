@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from jaxpose.datasets.types import Frame, Recording, check_frame
 from jaxpose.errors import DataError
 from jaxpose.estimate import Posterior
-from jaxpose.fields import Params, PoseField
+from jaxpose.fields import Covariances, Params, PoseField
 from jaxpose.geometry import rigid
 from jaxpose.geometry.camera import Camera, angle_of_view
 from jaxpose.imu import GRAVITY_WORLD, Gravity, Imu
@@ -73,6 +73,7 @@ class SlamResult(NamedTuple):
     field_rmse_m: float  # of the field at the frames' times to the tracked poses
     field_rmse_deg: float
     posterior: Posterior | None  # of a run with an IMU: covariance at any time, and the sensors
+    covariances: Covariances | None  # of the field
 
     @property
     def keyframes(self) -> Int[np.ndarray, " k"]:

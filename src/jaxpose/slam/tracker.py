@@ -179,7 +179,9 @@ def _update_state(
     T_world_body[:3, :3] = rigid.nearest_rotation(T_world_body[:3, :3])  # float32 adds up
     values = {"T_world_body": T_world_body, "status": status}
     if tracked is not None:
-        names = ("iterations", "loss", "depth_error", "colour_error", "valid", "sigma", "line_delay")
+        names = (
+            "iterations", "loss", "depth_error", "colour_error", "valid", "sigma", "covariance", "line_delay",
+        )  # fmt: skip
         values |= {name: getattr(tracked, name) for name in names}
     sure = registered is not None and status <= TrackingStatus.WEAK and frames.last_found == i - 1
     fade = np.exp(-dt / config.recovery.fading_s) if status == TrackingStatus.LOST else 1.0

@@ -54,6 +54,7 @@ class Frames(NamedTuple):
     colour_error: Float[np.ndarray, " n"]  # median, of colours in [0, 1]
     valid: Float[np.ndarray, " n"]  # share of the pixels with depth that the map explains
     sigma: Float[np.ndarray, "n 2"]  # [m, rad] of the pose, by what the image says of it
+    covariance: Float[np.ndarray, "n 6 6"]  # of the pose beside the map, over right increments of the camera
     seconds: Float[np.ndarray, " n"]  # wall time, compilation included
 
     @property
@@ -131,6 +132,7 @@ def no_frames(t: Float[np.ndarray, " n"]) -> Frames:
         colour_error=unknown,
         valid=unknown,
         sigma=np.full((count, 2), np.nan),
+        covariance=np.full((count, 6, 6), np.nan),
         seconds=unknown,
     )
 

@@ -87,9 +87,14 @@ def _write_trajectory(folder: Path, source: Source, result: SlamResult) -> None:
     trajectories.write_tum(folder / "trajectory.txt", in_files(result.T_world_cam))
     if ground_truth is not None:
         trajectories.write_tum(folder / "reference.txt", in_files(ground_truth))
-    known = None if result.posterior is None else result.posterior.covariances()
     alignment = Similarity(1.0, np.eye(3), origin) if origin.any() else None
-    save(folder / "field.npz", result.field, result.field_params, alignment=alignment, covariance=known)
+    save(
+        folder / "field.npz",
+        result.field,
+        result.field_params,
+        alignment=alignment,
+        covariance=result.covariances,
+    )
 
 
 def _write_surface(folder: Path, recording: Recording, result: SlamResult) -> tuple[str, ...]:

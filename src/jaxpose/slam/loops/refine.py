@@ -22,7 +22,7 @@ from jaxpose.slam.types import Frames, SlamState, TrackingStatus
 
 _OFF = 0.02, 0.01  # [m, rad] one sigma of a pose that is in no doubt
 _FASTER = 0.1  # [m/s, rad/s] one sigma of the speed between frames that are in none
-_FOUND = "loss", "depth_error", "colour_error", "valid", "sigma"  # of a registration
+_FOUND = "loss", "depth_error", "colour_error", "valid", "sigma", "covariance"  # of a registration
 
 
 def refined(

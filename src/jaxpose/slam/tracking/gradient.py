@@ -87,7 +87,7 @@ def make_gradient(
         exposure, unknown = jnp.asarray(image.exposure), jnp.full(2, jnp.nan)
         return Tracked(
             T_ref_body, params, total, depth_error, colour_error, exposure, valid, iterations, unknown,
-            jnp.zeros((6, 6)), jnp.full(2, jnp.nan),
+            jnp.full((6, 6), jnp.nan), jnp.zeros((6, 6)), jnp.full(2, jnp.nan),
         )  # fmt: skip
 
     return step

@@ -19,10 +19,11 @@ from jaxpose.losses import weighted_mean
 from jaxpose.slam.config import TrackConfig
 from jaxpose.slam.map.integrate import MapQuery, MapSampler
 from jaxpose.slam.observation import Image, Pixels, back_project, depth_sigma, sample_pixels
-from jaxpose.slam.tracking.predict import AHEAD, TrackingProblem
+from jaxpose.slam.tracking.predict import AHEAD, GO_TOGETHER, TrackingProblem
 
 _SETTLED = 2e-4  # [m, rad] a step this small ends the alignment
 _INDEPENDENT = 100.0  # pixels
+_PARTS = 4  # of an image along each side, in which errors go together
 _LONGEST = 0.2  # [m, rad] no step is longer
 _FLAT = 0.05  # a distance that changes less along a metre says nothing about the surface
 _DAMPING = 1e-4
@@ -42,6 +43,7 @@ class Tracked(NamedTuple):
     valid: Float[Array, ""]  # share of pixels with depth that the map explains
     iterations: Int[Array, ""]
     sigma: Float[Array, "2"]  # [m, rad] of the pose, by what the image says of it; NaN: not known
+    covariance: Float[Array, "6 6"]  # of the pose, over right increments of the camera; NaN: not known
     information: Float[Array, "6 6"]  # of the image alone, over right increments of the camera; 0: not known
     line_delay: Float[Array, "2"]  # correction [s] by the image, its information; NaN: not asked for
 
@@ -79,6 +81,8 @@ class Registration(NamedTuple):
 
     T_world_cam: Float[Array, "4 4"]
     information: Float[Array, "6 6"]  # Gauss-Newton's matrix over right increments
+    by_parts: Float[Array, "6 6"]  # covariance that the image's errors make, by how its parts disagree
+    share: Float[Array, "6 6"]  # of the prediction's error in the pose
     loss: Float[Array, ""]
     residuals: Residuals
     iterations: Int[Array, ""]
@@ -183,6 +187,7 @@ def register(
     image counts as `_INDEPENDENT` pixels, since errors of a map go together.
     """
     prior = jnp.linalg.inv(covariance)
+    part = _parts(pixels)
 
     def equations(T):
         found, by = surface_residuals(sample_map, T, pixels, config)
@@ -193,18 +198,19 @@ def register(
         information = jnp.matmul(weighted.T, slope, precision="highest")
         pull = jnp.matmul(expected, away, precision="highest")
         descent = jnp.matmul(residual, weighted, precision="highest") + pull
-        return information, expected, descent, found
+        return information, expected, descent, _errors(residual, slope, weight, part, expected), found
 
     def improve(carry):
         at, _ = carry
-        information, expected, descent, found = equations(at.T_world_cam)
+        information, expected, descent, errors, found = equations(at.T_world_cam)
         total = information + expected
         damped = total + _DAMPING * jnp.diag(jnp.diag(total)) + 1e-6 * jnp.eye(6)
         step = -jnp.linalg.solve(damped, descent)
         length = jnp.linalg.norm(step)
         step = step * jnp.minimum(1, _LONGEST / jnp.maximum(length, 1e-12))
         T = se3.compose(at.T_world_cam, se3.exp(step))
-        return Registration(T, information, image_loss(found, config), found, at.iterations + 1), length
+        loss = image_loss(found, config)
+        return Registration(T, information, *errors, loss, found, at.iterations + 1), length
 
     def unsettled(carry):
         at, length = carry
@@ -215,8 +221,43 @@ def register(
     nothing = Residuals(
         jnp.zeros(count), jnp.zeros((count, 3)), jnp.zeros(count), zero, zero, jnp.ones(3), zero
     )
-    start = Registration(T_world_cam, jnp.zeros((6, 6)), jnp.zeros(()), nothing, jnp.int32(0))
+    unknown = jnp.zeros((6, 6))
+    start = Registration(T_world_cam, unknown, unknown, unknown, jnp.zeros(()), nothing, jnp.int32(0))
     return jax.lax.while_loop(unsettled, improve, (start, jnp.inf))[0]
+
+
+def _errors(
+    residual: Float[Array, " m"],
+    slope: Float[Array, "m 6"],
+    weight: Float[Array, " m"],
+    part: Int[Array, " n"],
+    expected: Float[Array, "6 6"],
+) -> tuple[Float[Array, "6 6"], Float[Array, "6 6"]]:
+    """The covariance that the image's errors make, and the share of the prediction's error in the pose.
+
+    Of estimating equations whose errors go together in unknown ways within parts of the image, and not beyond
+    (Liang and Zeger 1986): what each part's residuals pull by is squared.
+    """
+    rows = jnp.concatenate([part, jnp.repeat(part, 3)])
+    pulls = jax.ops.segment_sum((weight * residual)[:, None] * slope, rows, _PARTS**2)
+    seen = jnp.sum(jnp.any(pulls != 0, axis=1))
+    free = seen / jnp.maximum(seen - 6, 1)  # six of the parts' sums are made nothing by the pose
+    # Beyond one sigma a residual pulls by its sign alone: it does not hold the pose.
+    holds = jnp.where(jnp.abs(residual) <= 1, weight, 0)[:, None] * slope
+    stiffness = jnp.matmul(holds.T, slope, precision="highest") + expected
+    inverse = jnp.linalg.inv(stiffness + 1e-6 * jnp.eye(6))
+    moves = jnp.matmul(pulls, inverse, precision="highest")
+    share = jnp.matmul(inverse, expected, precision="highest")
+    return free * jnp.matmul(moves.T, moves, precision="highest"), share
+
+
+def _parts(pixels: Pixels) -> Int[Array, " n"]:
+    """Which part of the image each pixel is in."""
+    place = pixels.direction_cam[:, :2]
+    first, last = jnp.min(place, axis=0), jnp.max(place, axis=0)
+    share = (place - first[None]) / jnp.maximum(last - first, 1e-6)[None]
+    cell = jnp.clip((_PARTS * share).astype(jnp.int32), 0, _PARTS - 1)
+    return cell[:, 1] * _PARTS + cell[:, 0]
 
 
 def _stacked(
@@ -265,6 +306,17 @@ def pose_sigma(found: Registration, support: Float[Array, "6 6"]) -> Float[Array
     return jnp.stack([worst(covariance[:3, :3]), worst(covariance[3:, 3:])])
 
 
+def pose_covariance(found: Registration, problem: TrackingProblem) -> Float[Array, "6 6"]:
+    """Covariance of a registered pose beside the map, over right increments of the camera.
+
+    Of the prediction's error what features share from frame to frame is no part: it moves map and pose alike.
+    """
+    predicted = jnp.linalg.inv(jnp.linalg.inv(problem.covariance) + (GO_TOGETHER - 1) * problem.support)
+    return found.by_parts + jnp.einsum(
+        "ij,jk,lk->il", found.share, predicted, found.share, precision="highest"
+    )
+
+
 def image_information(found: Registration) -> Float[Array, "6 6"]:
     """What an image says of its pose, counted as `_INDEPENDENT` pixels."""
     return found.information / _weight(found.residuals)
@@ -305,6 +357,7 @@ def make_register(
             residuals.valid,
             found.iterations,
             pose_sigma(found, problem.support),
+            pose_covariance(found, problem),
             image_information(found),
             correction,
         )
