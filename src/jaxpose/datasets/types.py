@@ -75,6 +75,7 @@ class Photographs(NamedTuple):
     notes: tuple[str, ...] = ()  # notes of the loader for the user
     mask: Bool[np.ndarray, "n h w"] | None = None  # which pixels count; None: all
     lenses: tuple[Lens, ...] = ()  # of the image files as they are on disk; empty: they are on none
+    turns: Float[np.ndarray, "n 3 3"] | None = None  # camera to world, where a gyroscope alone tells them
 
 
 class EventRecording(NamedTuple):
@@ -267,6 +268,7 @@ def take(photographs: Photographs, indices: Int[np.ndarray, " m"]) -> Photograph
         files=tuple(photographs.files[i] for i in indices),
         mask=None if photographs.mask is None else photographs.mask[indices],
         lenses=tuple(photographs.lenses[i] for i in indices) if photographs.lenses else (),
+        turns=None if photographs.turns is None else photographs.turns[indices],
     )
 
 

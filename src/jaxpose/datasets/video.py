@@ -4,6 +4,7 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from fractions import Fraction
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 from jaxpose.errors import DataError
 
 EXTRA = 'pip install -e ".[video]"'
+SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm")
 _NEAR = 8  # frames ahead that are decoded on the way instead of sought
 
 
@@ -54,7 +56,7 @@ class Video:
     """
 
     def __init__(self, path: Path, track: int = 0, stamps: Sequence[int] = ()):
-        self.path = path
+        self.path, self._track = path, track
         if not stamps:
             with opened(path) as container:
                 stamps = [packet.pts for packet in container.demux(video=track) if packet.pts is not None]
@@ -83,6 +85,12 @@ class Video:
         """Timestamps of the frames on the file's clock [ns]."""
         unit = self._stream.time_base or Fraction(1)
         return [round(pts * unit * 10**9) for pts in self._pts]
+
+    @cached_property
+    def quarter_turns(self) -> int:
+        """How often frames are to be turned by 90 degrees to the left to be shown, by the file."""
+        with opened(self.path) as container:
+            return round(next(container.decode(video=self._track)).rotation / 90) % 4
 
     def read(self, i: int, size: tuple[int, int] | None = None) -> np.ndarray:
         """Frame i as (height, width, 3) uint8 RGB, resized by area to `size` (width, height) if given."""

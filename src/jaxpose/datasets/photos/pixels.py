@@ -63,7 +63,7 @@ def read_images(
     Every image must be of the size of `full`; `stated` says in the error where that size comes from. Images
     are not enlarged: DataError for a `width` beyond theirs, ValueError for one below 1.
     """
-    small = _smaller(files[0], full, width)
+    small = smaller_view(files[0], full, width)
     for file in files:
         size = image_size(file)
         if size != (full.width, full.height):
@@ -108,7 +108,7 @@ def read_views(
     turned = [_turned(file, seen, stated) for file, seen in zip(files, lenses, strict=True)]
     one = lens.as_camera(lenses[0]) if len(set(lenses)) == 1 else None
     full, beyond = (one, False) if one is not None else lens.pinhole_for(lenses)
-    small = _smaller(files[0], full, width)
+    small = smaller_view(files[0], full, width)
     rgb = np.full((len(files), small.height, small.width, 3), 255, np.uint8)
     kept = np.ones(rgb.shape[:3], bool)
     transparent, maps = False, {}
@@ -163,7 +163,8 @@ class _Resampling:
         )
 
 
-def _smaller(file: Path, full: Camera, width: int | None) -> Camera:
+def smaller_view(file: Path, full: Camera, width: int | None) -> Camera:
+    """The camera of images that are resized to a width; DataError naming the file for a wider one."""
     if width is None:
         return full
     if width < 1:

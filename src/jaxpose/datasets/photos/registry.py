@@ -5,11 +5,11 @@ from types import ModuleType
 from typing import Literal, NamedTuple, get_args
 
 from jaxpose.datasets.images import found
-from jaxpose.datasets.photos import blender, colmap, llff, plain
+from jaxpose.datasets.photos import blender, colmap, llff, plain, video
 from jaxpose.datasets.types import Photographs
 from jaxpose.errors import DataError
 
-Format = Literal["llff", "transforms", "colmap", "plain"]
+Format = Literal["llff", "transforms", "colmap", "plain", "video"]
 
 
 class Layout(NamedTuple):
@@ -32,6 +32,12 @@ LAYOUTS: dict[Format, Layout] = {
     ),
     "colmap": Layout("COLMAP", "a sparse model", colmap, "pycolmap"),
     "plain": Layout("photographs without poses", "images alone", plain, "made folders with EXIF by Pillow"),
+    "video": Layout(
+        "a video, with or without a gyroscope's csv (extra `video`)",
+        "a video alone",
+        video,
+        "a film of a made room by PyAV, with a csv",
+    ),
 }
 
 
@@ -71,15 +77,15 @@ def load_photographs(
         focal_px: Focal length of the images as they are on disk [px], where no file states a camera.
 
     Returns:
-        Photographs to train on, and those held out. Poses are NaN where none are known, in layout "plain".
+        Photographs to train on, and those held out. Poses are NaN where none are known: "plain", "video".
 
     Raises:
         DataError: Naming the file for anything that cannot be used, and for a focal length beside a camera.
         ValueError: For a width below 1.
     """
     format = format or find_format(path)
-    if format == "plain":
-        return plain.load(path, width=width, focal_px=focal_px)
+    if format in ("plain", "video"):
+        return LAYOUTS[format].module.load(path, width=width, focal_px=focal_px)
     if focal_px is not None:
         files = LAYOUTS[format].files
         raise DataError(f"{path}: expected no focal length with {files}, which states cameras")

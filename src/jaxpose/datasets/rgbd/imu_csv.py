@@ -106,6 +106,49 @@ def read_imu(file: Path | str) -> ImuFile:
     )
 
 
+class Rates(NamedTuple):
+    """What a gyroscope read, as a file has it, at whole ns on its own clock."""
+
+    ns: list[int]
+    omega: Float[np.ndarray, "n 3"]  # [rad/s] where the header states a unit, else as they are
+    unit: str | None  # that the header states
+
+
+def read_rates(file: Path | str) -> Rates:
+    """Read the readings of a gyroscope: a table whose header names them, whatever else is in it.
+
+    In a file whose name has "gyro" the columns may be x, y and z alone.
+
+    Args:
+        file: The table.
+
+    Returns:
+        The readings.
+
+    Raises:
+        DataError: As `read_imu`, and for a header without a gyroscope.
+    """
+    file = Path(file)
+    table = joined_clock(read_table(file))
+    alone = "gyro" in file.stem.lower()
+    names = {"t": _NAMES["t"]} | {
+        f"w{axis}": rf"({_NAMES[f'w{axis}']}|{axis})" if alone else _NAMES[f"w{axis}"] for axis in "xyz"
+    }
+    named = named_columns(table, names) if table.rows else None
+    if named is None:
+        raise DataError(f"{file}: expected a header that names {' '.join(names)}, got none")
+    unit: Unit = "s" if table.separator is None else "ns"
+    at, stated = tuple(named.at[name] for name in names), named.unit
+    rows = stamped_rows(
+        file, table, "a gyroscope", at, unit=stated or unit, exact=stated is not None, steps=READINGS
+    )
+    if len(rows.ns) < 2:
+        raise DataError(f"{file}: expected at least 2 readings, got {len(rows.ns)}")
+    text = named.stated["wx"]
+    factor = _TO_SI.get(text.lower().replace(" ", "").replace("\u00b0", "deg")) if text else None
+    return Rates(rows.ns, (factor or 1.0) * rows.values, text if factor else None)
+
+
 def names_readings(file: Path) -> bool:
     """Whether the header of a table names some quantities of an IMU, though it may lack others.
 

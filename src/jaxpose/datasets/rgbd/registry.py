@@ -25,6 +25,7 @@ from jaxpose.datasets.rgbd import (
     tum,
 )
 from jaxpose.datasets.types import Recording
+from jaxpose.datasets.video import SUFFIXES
 from jaxpose.errors import DataError
 
 Format = Literal[
@@ -193,6 +194,8 @@ def nearest(path: Path | str) -> str:
         What is there; the recordings in it, or else the nearest format and what it lacks.
     """
     path = Path(path)
+    if path.is_file() and path.suffix.lower() in SUFFIXES:
+        return "a video without depth, of which `nerf` takes photographs"
     if not path.is_dir():
         return found(path)
     if inner := _recordings_in(path):

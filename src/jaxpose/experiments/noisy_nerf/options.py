@@ -232,7 +232,10 @@ def disturbed(config: Config, train: Photographs, extent: float) -> tuple[Float[
     if config.noise == "unknown":
         T_same = np.tile(np.eye(4), (len(ground_truth), 1, 1))
         T_same[:, 2, 3] = -middle(train)
-        return T_same, "poses unknown: all start in one place"
+        if train.turns is None:
+            return T_same, "poses unknown: all start in one place"
+        T_same[:, :3, :3] = train.turns
+        return T_same, "poses unknown: all start in one place, turned as the gyroscope says"
     if config.noise == "independent":
         T_noise = pose_noise.independent(len(ground_truth), config.noise_sigma, config.seed)
         words = f"independent, twists of N(0, {config.noise_sigma:g}^2) [scene units and rad]"

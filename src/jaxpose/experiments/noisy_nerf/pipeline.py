@@ -250,16 +250,16 @@ def _write_poses(folder: Path, config: Config, problem: Problem, measured: Measu
         trajectories.write_tum(folder / name, trajectories.Trajectory(photographs.t, in_data(T)))
     with atomic.atomic(folder / "start.npz") as temporary:
         np.savez(temporary, t=photographs.t, T_world_cam=in_data(problem.T_start))
-    images = "." if config.data == ORBIT else images_folder(config.data).resolve()
+    images = images_folder(config.data).resolve() if photographs.lenses else "."
     # The camera of the run is that of the files only where they were not brought to another.
     own = len(set(photographs.lenses)) == 1 and as_camera(photographs.lenses[0]) is not None
     names = photographs.files if own or not photographs.lenses else ()
     write_camera(folder / "camera.json", photographs.camera, names, images)
-    if config.data == ORBIT:  # its images are on no disk yet
-        for part in (photographs, problem.held_out):
-            for name, rgb in zip(part.files, part.rgb, strict=True):
-                (folder / name).parent.mkdir(exist_ok=True)
-                imageio.imwrite(folder / name, rgb)
+    for part in () if photographs.lenses else (photographs, problem.held_out):  # on no disk yet
+        for name, rgb in zip(part.files, part.rgb, strict=True):
+            (folder / name).parent.mkdir(exist_ok=True)
+            imageio.imwrite(folder / name, rgb)
+    if config.data == ORBIT:
         write_transforms(folder / "transforms_test.json", problem.held_out)
         write_transforms(folder / "transforms_train.json", refined)
     elif find_format(config.data) == "transforms":
