@@ -193,7 +193,7 @@ def _table(named: bool, folder: Path) -> None:
 
 def _map(folder: Path) -> None:
     config, coords = BlockConfig(0.05, 0.2), np.array([[0, 0, 0], [1, 0, 0]])
-    values = np.full((2, NODES, NODES, NODES, CHANNELS), 0.1, np.float32)
+    values = np.full((2, NODES, NODES, NODES, CHANNELS), 1000, np.int16)
     slot = np.zeros(16, np.int32)
     texture = Texture(slot, np.zeros((1, SIDE, SIDE, SIDE, 4), np.uint8))
     write_map(folder / "map.npz", SavedMap(config, unpacked(config, coords, values), texture, np.arange(3)))

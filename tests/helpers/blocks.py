@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from jaxpose.scenes.voxel_blocks import CELLS, empty_blocks, with_blocks
+from jaxpose.scenes.voxel_blocks import CELLS, empty_blocks, of_distance_and_colour, with_blocks
 
 
 def over_box(config, lower, upper):
@@ -11,7 +11,7 @@ def over_box(config, lower, upper):
     corners = np.floor(np.array([lower, upper]) / (CELLS * config.voxel)).astype(int)
     ranges = [np.arange(low, high + 1) for low, high in corners.T]
     coords = np.stack(np.meshgrid(*ranges, indexing="ij"), axis=-1).reshape(-1, 3)
-    return with_blocks(config, empty_blocks(config, capacity=len(coords) + 1, side=32), coords)
+    return with_blocks(config, empty_blocks(config, capacity=len(coords) + 1, side=4, bricks=64), coords)
 
 
 def node_positions(config, blocks):
@@ -25,5 +25,5 @@ def filled(config, lower, upper, values_at):
     """Blocks over a box whose first four channels are `values_at(points)`."""
     blocks = over_box(config, lower, upper)
     values = np.array(blocks.values)
-    values[1 : int(blocks.count), ..., :4] = values_at(node_positions(config, blocks))
+    values[1 : int(blocks.count)] = of_distance_and_colour(config, values_at(node_positions(config, blocks)))
     return blocks._replace(values=jnp.asarray(values))

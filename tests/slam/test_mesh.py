@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
-from helpers.blocks import filled, over_box
+from helpers.blocks import filled, node_positions, over_box
 
 from jaxpose.files.ply import read_points, write_ply
 from jaxpose.geometry.camera import Camera
@@ -86,6 +86,15 @@ def test_a_whole_sphere_is_closed(blocks, keyframes):
     solid = trimesh.Trimesh(surface.points, surface.faces, process=False)
     assert solid.is_watertight
     assert solid.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.02)
+
+
+def test_where_measuring_ends_behind_a_surface_there_is_none(blocks, keyframes):
+    """Integration leaves nodes far behind a surface as free as they were: their sign changes once more."""
+    values, nodes = np.array(blocks.values), node_positions(CONFIG, blocks)
+    values[1 : len(nodes) + 1][np.linalg.norm(nodes, axis=-1) < RADIUS - 0.06] = values[0, 0, 0, 0]
+    hollow = mesh(CONFIG, blocks._replace(values=jnp.asarray(values)), keyframes, CAMERA)
+    assert len(hollow.points) == len(mesh(CONFIG, blocks, keyframes, CAMERA).points) > 500
+    assert np.linalg.norm(hollow.points, axis=1).min() > RADIUS - 0.04**2 / RADIUS
 
 
 def test_nothing_seen_is_an_empty_mesh(blocks, keyframes):

@@ -71,7 +71,7 @@ def test_what_no_keyframe_saw_keeps_the_colour_of_the_map():
     texture = make_texture(CONFIG, BLOCKS, [keyframe(0, 0.0)], CAMERA)
     assert texture.slot.shape == BLOCKS.coords.shape[:1] and set(np.unique(texture.tiles[..., 3])) == {0, 255}
     _, rgb = seen_at([[0.0, 0.0, WALL_Z - 0.1], [0.0, 0.0, WALL_Z + 0.1]], texture)
-    assert_allclose(rgb, 0.5, atol=1e-6)
+    assert_allclose(rgb, 0.5, atol=1e-4)  # as 16 bits hold it
 
 
 def test_a_keyframe_that_sees_something_else_there_paints_nothing():

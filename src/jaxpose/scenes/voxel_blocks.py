@@ -2,11 +2,14 @@
 
 Space is cut into blocks of `CELLS`^3 cells. A block near a surface has a row in a pool, which holds its
 (CELLS + 1)^3 nodes; neighbours hold the nodes between them twice, so that a point reads one block only. A
-table says which row a block has; row 0 is empty space and stays so. Shapes depend on the capacity of the pool
-and the side of the table, not on how far the scene reaches, so that nothing is compiled anew while it grows.
+table of two levels says which row a block has; row 0 is empty space and stays so. Shapes depend on the
+capacity of the pool and of the table, not on how far the scene reaches, so that nothing is compiled anew
+while it grows.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -19,11 +22,18 @@ from jaxpose.scenes.voxel_grid import GridConfig
 
 CELLS = 8  # along each side of a block
 NODES = CELLS + 1
-# Signed distance [m], red, green, blue, wide-band distance [m], 1 where that is known; and the weights with
-# which distance, colour and wide-band distance were integrated so far.
-CHANNELS, SAMPLED = 9, 6
-_CAPACITY = 8192  # blocks of a new pool: 215 MB, a furnished room
-_SIDE = 128  # of a new table, in blocks
+# Signed distance [m], red, green, blue, wide-band distance [m]; and the weights with which distance, colour
+# and wide-band distance were integrated so far.
+CHANNELS, SAMPLED = 8, 5
+_CAPACITY = 20_480  # blocks of a new pool: 239 MB, a furnished office
+_GROWTH = 1.5  # of a full pool
+_SIDE, _BRICKS = 64, 1024  # of a new table: its side in bricks, and how many of these may hold blocks
+_BRICK = 8  # blocks along each side of a brick
+_ROW_BYTES = 2 * NODES**3 * CHANNELS
+# Numbers of the pool have 16 bits: distances up to the truncation, and to the width of a block; colour, which
+# may be exposed as another image, up to 2; and the roots of weights, up to `MEMORY`.
+MEMORY = 100.0  # frames, at a depth of one metre: older ones are slowly forgotten
+_WHOLE = 2**15 - 1
 
 
 @dataclass(frozen=True)
@@ -40,14 +50,19 @@ class BlockConfig:
             )
 
 
+class PoolFull(Exception):
+    """More blocks are needed than a budget of memory holds."""
+
+
 class Blocks(NamedTuple):
     """The blocks of a scene; a pytree of arrays, on the host or on a device."""
 
-    table: Int[Any, "s s s"]  # the row of each block of space in the pool; 0: none
-    corner: Int[Any, "3"]  # which block of space the table begins with
+    bricks: Int[Any, "s s s"]  # which part of `table` each brick of space has; 0: none
+    corner: Int[Any, "3"]  # which brick of space `bricks` begins with
+    table: Int[Any, "b 8 8 8"]  # the row of each block of a brick in the pool; 0: none
     coords: Int[Any, "c 3"]  # which block of space each row is
     count: Int[Any, ""]  # how many rows are in use, the empty one among them
-    values: Float[Any, "c 9 9 9 9"]  # `CHANNELS` of each node
+    values: Int[Any, "c 9 9 9 8"]  # `CHANNELS` of each node, as `encoded` has them
 
 
 def voxel_blocks(config: BlockConfig) -> SceneField:
@@ -68,24 +83,57 @@ def voxel_blocks(config: BlockConfig) -> SceneField:
     return SceneField(init, query)
 
 
-def empty_blocks(config: BlockConfig, *, capacity: int = _CAPACITY, side: int = _SIDE) -> Blocks:
+def empty_blocks(
+    config: BlockConfig, *, capacity: int = _CAPACITY, side: int = _SIDE, bricks: int = _BRICKS
+) -> Blocks:
     """Blocks of a scene in which nothing was seen; the table is centred on the world's origin."""
     return Blocks(
         jnp.zeros((side, side, side), jnp.int32),
         jnp.full(3, -side // 2, jnp.int32),
+        jnp.zeros((bricks, _BRICK, _BRICK, _BRICK), jnp.int32),
         jnp.zeros((capacity, 3), jnp.int32),
         jnp.int32(1),
         jnp.broadcast_to(_free(config), (capacity, NODES, NODES, NODES, CHANNELS)),
     )
 
 
+def encoded(config: BlockConfig, values: Float[Array, "*n 8"]) -> Int[Array, "*n 8"]:
+    """Channels of nodes as the pool has them; what is beyond its range is cut off."""
+    weights = jnp.sqrt(values[..., SAMPLED:] / MEMORY)
+    scaled = jnp.concatenate([values[..., :SAMPLED] / _range(config, values.ndim), weights], axis=-1)
+    whole = jnp.round(_WHOLE * jnp.clip(scaled, -1, 1))
+    least = jnp.concatenate([jnp.full_like(whole[..., :SAMPLED], -_WHOLE), jnp.sign(weights)], axis=-1)
+    return jnp.maximum(whole, least).astype(jnp.int16)  # what has a weight keeps one
+
+
+def decoded(config: BlockConfig, stored: Int[Any, "*n 8"]) -> Float[Any, "*n 8"]:
+    """The channels of nodes that `encoded` has made, float32; arrays stay where they are."""
+    scaled, join = stored.astype(np.float32) / np.float32(_WHOLE), jnp.concatenate
+    if isinstance(stored, np.ndarray):
+        join = np.concatenate
+    weights = np.float32(MEMORY) * scaled[..., SAMPLED:] ** 2
+    return join([scaled[..., :SAMPLED] * _range(config, stored.ndim), weights], axis=-1)
+
+
+def _range(config: BlockConfig, dimensions: int = 1) -> Float[np.ndarray, "... 5"]:
+    """The largest value of each sampled channel that the pool holds, along the last of some dimensions."""
+    largest = np.array([config.truncation, 2, 2, 2, CELLS * config.voxel], np.float32)
+    return largest.reshape((1,) * (dimensions - 1) + (SAMPLED,))
+
+
 def sample_blocks(config: BlockConfig, blocks: Blocks, point: Float[Array, "3"]) -> Float[Array, "6"]:
-    """Distance, colour, wide-band distance and whether it is known, trilinear at a point [m].
+    """Distance, colour, wide-band distance and 1 where that is known, trilinear at a point [m].
 
     Those of free space where there is no block.
     """
+    scale = _range(config) / np.float32(_WHOLE)
+
+    def node(stored):
+        known = (stored[CHANNELS - 1 :] > 0).astype(point.dtype)
+        return jnp.concatenate([stored[:SAMPLED].astype(point.dtype) * scale.astype(point.dtype), known])
+
     row, local = block_at(config, blocks, point)
-    return trilinear_in_block(blocks.values, row, local, SAMPLED)
+    return trilinear_in_block(blocks.values, row, local, node)
 
 
 def block_at(
@@ -95,16 +143,22 @@ def block_at(
     position = point / config.voxel
     block = jnp.floor(jax.lax.stop_gradient(position) / CELLS)
     local = position - CELLS * block
-    place, side = block.astype(jnp.int32) - blocks.corner, blocks.table.shape[0]
+    block, side = block.astype(jnp.int32), blocks.bricks.shape[0]
+    place, within = block // _BRICK - blocks.corner, block % _BRICK
     inside = jnp.all((place >= 0) & (place < side))
     a, b, c = jnp.where(inside, place, 0)
-    return jnp.where(inside, blocks.table.reshape(-1)[(a * side + b) * side + c], 0), local
+    brick = jnp.where(inside, blocks.bricks.reshape(-1)[(a * side + b) * side + c], 0)
+    a, b, c = within
+    return blocks.table.reshape(-1)[((brick * _BRICK + a) * _BRICK + b) * _BRICK + c], local
 
 
 def trilinear_in_block(
-    values: Shaped[Array, "c n n n _"], row: Int[Array, ""], local: Float[Array, "3"], count: int
+    values: Shaped[Array, "c n n n _"],
+    row: Int[Array, ""],
+    local: Float[Array, "3"],
+    of_node: Callable[[Shaped[Array, " _"]], Float[Array, " k"]],
 ) -> Float[Array, " k"]:
-    """The first `count` channels of one block (row) at a place given in its cells."""
+    """What `of_node` says of the channels of nodes, between those of one block (row), at a place in cells."""
     nodes, channels = values.shape[1], values.shape[4]
     cell = jnp.clip(jnp.floor(jax.lax.stop_gradient(local)), 0, nodes - 2)
     fraction = local - cell
@@ -113,8 +167,8 @@ def trilinear_in_block(
 
     def along_z(a, b):
         start = (((row * nodes + i + a) * nodes + j + b) * nodes + k) * channels
-        pair = jax.lax.dynamic_slice(flat, (start,), (2 * channels,)).astype(local.dtype)
-        return _between(pair[:count], pair[channels : channels + count], fraction[2])
+        pair = jax.lax.dynamic_slice(flat, (start,), (2 * channels,))
+        return _between(of_node(pair[:channels]), of_node(pair[channels:]), fraction[2])
 
     low = _between(along_z(0, 0), along_z(0, 1), fraction[1])
     high = _between(along_z(1, 0), along_z(1, 1), fraction[1])
@@ -132,49 +186,82 @@ def touched_blocks(
     return np.unique((first[:, None] + offsets).reshape(-1, 3), axis=0)
 
 
-def with_blocks(config: BlockConfig, blocks: Blocks, wanted: Int[np.ndarray, "m 3"]) -> Blocks:
+def with_blocks(
+    config: BlockConfig, blocks: Blocks, wanted: Int[np.ndarray, "m 3"], *, budget: float = np.inf
+) -> Blocks:
     """The scene with rows for these blocks of space, free where they are new.
 
-    The pool doubles when it is full, and the table when space goes beyond it: only then shapes change.
+    Pool and table grow when they are full: only then shapes change. PoolFull where the pool would then need
+    more than `budget` [bytes], old and new together.
     """
-    table, corner = np.asarray(blocks.table), np.asarray(blocks.corner)
-    count, capacity, side = int(blocks.count), blocks.values.shape[0], table.shape[0]
-    lower, upper = (wanted - corner).min(axis=0), (wanted - corner).max(axis=0)
-    while (lower < 0).any() or (upper >= side).any():  # twice the side, the old table in the middle
-        table = np.pad(table, side // 2)
-        corner, lower, upper, side = corner - side // 2, lower + side // 2, upper + side // 2, 2 * side
-    place = tuple((wanted - corner).T)
-    new = wanted[table[place] == 0]
-    if len(new) == 0:
+    table, coords, count = np.asarray(blocks.table), blocks.coords, int(blocks.count)
+    bricks, corner, used = _with_bricks(blocks, np.unique(wanted // _BRICK, axis=0))
+    table = np.pad(table, [(0, _room_for(used, len(table)) - len(table)), *[(0, 0)] * 3])
+    place = (bricks[tuple((wanted // _BRICK - corner).T)], *(wanted % _BRICK).T)
+    is_new = table[place] == 0
+    new, values = wanted[is_new], blocks.values
+    if not len(new):
         return blocks
-    values, coords = blocks.values, np.array(blocks.coords)
-    while count + len(new) > capacity:
-        free = jnp.broadcast_to(_free(config), values.shape)
-        values, coords = jnp.concatenate([values, free]), np.pad(coords, [(0, capacity), (0, 0)])
-        capacity *= 2
-    table = np.array(table)
-    table[tuple((new - corner).T)] = np.arange(count, count + len(new))
+    capacity = _room_for(count + len(new), len(values), budget / _ROW_BYTES)
+    if capacity > len(values):
+        values = _enlarged(values, _free(config), capacity)
+    table, coords = np.array(table), np.pad(np.asarray(coords), [(0, capacity - len(coords)), (0, 0)])
+    table[tuple(x[is_new] for x in place)] = np.arange(count, count + len(new))
     coords[count : count + len(new)] = new
     return Blocks(
-        jnp.asarray(table),
+        jnp.asarray(bricks),
         jnp.asarray(corner, jnp.int32),
+        jnp.asarray(table),
         jnp.asarray(coords),
         jnp.int32(count + len(new)),
         values,
     )
 
 
-def packed(blocks: Blocks) -> tuple[Int[np.ndarray, "n 3"], Float[np.ndarray, "n 9 9 9 9"]]:
-    """The rows in use, on the host: which block of space each is, and its nodes."""
+def _with_bricks(
+    blocks: Blocks, wanted: Int[np.ndarray, "m 3"]
+) -> tuple[Int[np.ndarray, "s s s"], Int[np.ndarray, "3"], int]:
+    """The upper level of the table with these bricks of space, its corner, and how many bricks there are."""
+    bricks, corner = np.array(blocks.bricks), np.asarray(blocks.corner)
+    lower, upper = (wanted - corner).min(axis=0), (wanted - corner).max(axis=0)
+    while (lower < 0).any() or (upper >= len(bricks)).any():  # twice the side, the old one in the middle
+        half = len(bricks) // 2
+        bricks = np.pad(bricks, half)
+        corner, lower, upper = corner - half, lower + half, upper + half
+    used = int(bricks.max(initial=0)) + 1
+    place = tuple((wanted - corner).T)
+    new = bricks[place] == 0
+    bricks[tuple(x[new] for x in place)] = np.arange(used, used + new.sum())
+    return bricks, corner, used + int(new.sum())
+
+
+def _room_for(count: int, room: int, most: float = np.inf) -> int:
+    """A size that holds `count`: `room`, or one grown from it, not beyond `most` with the last together."""
+    while room < count:
+        grown = int(min(_GROWTH * room, most - room))
+        if grown <= room:
+            raise PoolFull
+        room = grown
+    return room
+
+
+@partial(jax.jit, static_argnums=2)
+def _enlarged(values: Int[Array, "c n n n k"], free: Int[Array, " k"], capacity: int):
+    """A pool with more rows, free ones."""
+    return jnp.broadcast_to(free, (capacity, *values.shape[1:])).at[: len(values)].set(values)
+
+
+def packed(blocks: Blocks) -> tuple[Int[np.ndarray, "n 3"], Int[np.ndarray, "n 9 9 9 8"]]:
+    """The rows in use, on the host: which block of space each is, and its nodes as they are stored."""
     count = int(blocks.count)
-    return np.asarray(blocks.coords)[1:count], np.asarray(blocks.values[1:count])
+    return np.asarray(blocks.coords)[1:count], np.asarray(blocks.values)[1:count]
 
 
 def unpacked(
-    config: BlockConfig, coords: Int[np.ndarray, "n 3"], values: Float[np.ndarray, "n 9 9 9 9"]
+    config: BlockConfig, coords: Int[np.ndarray, "n 3"], values: Int[np.ndarray, "n 9 9 9 8"]
 ) -> Blocks:
     """The scene that `packed` took apart."""
-    blocks = empty_blocks(config)
+    blocks = empty_blocks(config, capacity=_room_for(len(coords) + 1, _CAPACITY))
     if not len(coords):
         return blocks
     blocks = with_blocks(config, blocks, np.asarray(coords, np.int64))
@@ -192,8 +279,18 @@ def blocks_of_grid(config: GridConfig, values: Float[np.ndarray, "x y z 4"]) -> 
     windows = windows[::CELLS, ::CELLS, ::CELLS]
     near = np.argwhere((np.abs(windows[..., 0, :, :, :]) < config.truncation).any(axis=(3, 4, 5)))
     chosen = np.moveaxis(windows[tuple(near.T)], 1, -1)
-    chosen = np.concatenate([chosen, np.zeros((*chosen.shape[:-1], CHANNELS - 4), chosen.dtype)], axis=-1)
-    return size, unpacked(size, near + (first - before) // CELLS, chosen)
+    return size, unpacked(size, near + (first - before) // CELLS, of_distance_and_colour(size, chosen))
+
+
+def of_distance_and_colour(
+    config: BlockConfig, values: Float[np.ndarray, "n 9 9 9 4"]
+) -> Int[np.ndarray, "n 9 9 9 8"]:
+    """Nodes of distance [m] and colour, known everywhere, as they are stored; without a wide-band distance."""
+    values = np.asarray(values, np.float32)
+    unknown, known = np.zeros_like(values[..., :1]), np.ones_like(values[..., :2])
+    return np.asarray(
+        encoded(config, jnp.asarray(np.concatenate([values, unknown, known, unknown], axis=-1)))
+    )
 
 
 def bounds(config: BlockConfig, blocks: Blocks) -> Float[np.ndarray, "2 3"]:
@@ -204,9 +301,9 @@ def bounds(config: BlockConfig, blocks: Blocks) -> Float[np.ndarray, "2 3"]:
     return CELLS * config.voxel * np.stack([coords.min(axis=0), coords.max(axis=0) + 1])
 
 
-def _free(config: BlockConfig) -> Float[Array, "9"]:
+def _free(config: BlockConfig) -> Int[Array, "8"]:
     """What stands where nothing was seen: free space, grey, no wide-band distance, no weights."""
-    return jnp.array([config.truncation, 0.5, 0.5, 0.5, *[0.0] * (CHANNELS - 4)], jnp.float32)
+    return encoded(config, jnp.array([config.truncation, 0.5, 0.5, 0.5, *[0.0] * (CHANNELS - 4)]))
 
 
 def _between(a: Float[Array, " c"], b: Float[Array, " c"], fraction: Float[Array, ""]) -> Float[Array, " c"]:

@@ -12,7 +12,15 @@ from jaxpose.errors import DataError
 from jaxpose.files import atomic
 from jaxpose.files.schema import check_version, numbers
 from jaxpose.files.untrusted import read_npz
-from jaxpose.scenes.voxel_blocks import CHANNELS, NODES, BlockConfig, Blocks, packed, unpacked
+from jaxpose.scenes.voxel_blocks import (
+    NODES,
+    BlockConfig,
+    Blocks,
+    decoded,
+    of_distance_and_colour,
+    packed,
+    unpacked,
+)
 from jaxpose.slam.map.texture import SIDE, Texture
 
 _VERSION = 3
@@ -36,10 +44,10 @@ def write_map(path: Path | str, saved: SavedMap) -> None:
     `values` (n, 9, 9, 9, 4) are signed distance [m] and colour at its nodes, `texture_tiles` (m, 17, 17, 17,
     4) finer colour and 255 where there is any, tile `texture_slot[k]` for block k.
     """
-    coords, values = packed(saved.blocks)
+    coords, stored = packed(saved.blocks)
     arrays = asdict(saved.config) | {
         "coords": coords,
-        "values": values[..., :4],
+        "values": decoded(saved.config, stored)[..., :4],
         "keyframes": saved.keyframes,
     }
     arrays |= {
@@ -62,8 +70,7 @@ def read_map(path: Path | str) -> SavedMap:
     if reach > min(_FARTHEST_BLOCK, count + 64) or len(np.unique(coords, axis=0)) != count:
         raise DataError(f"{path}: coords: expected blocks beside each other, got {reach} of {count} away")
     number("values", (count, NODES, NODES, NODES, 4), least=-_LARGEST_M, most=_LARGEST_M)
-    values = np.pad(content["values"].astype(np.float32), [(0, 0)] * 4 + [(0, CHANNELS - 4)])
-    blocks = unpacked(config, coords, values)
+    blocks = unpacked(config, coords, of_distance_and_colour(config, content["values"]))
     tiles = content.get("texture_tiles")
     if (
         tiles is None

@@ -57,7 +57,7 @@ def _emptied(blocks: Blocks) -> Blocks:
     """The blocks with nothing in them, in the same memory; row 0 is empty space."""
     nothing = jax.tree.map(jnp.zeros_like, blocks)
     values = jnp.broadcast_to(blocks.values[:1], blocks.values.shape)
-    return nothing._replace(corner=blocks.corner, count=jnp.int32(1), values=values)
+    return nothing._replace(corner=blocks.corner, count=jnp.ones_like(blocks.count), values=values)
 
 
 def posed(state: SlamState, frame: Frame, i: int) -> Posed:

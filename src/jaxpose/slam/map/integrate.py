@@ -24,10 +24,13 @@ from jaxpose.geometry.camera import Camera, pixel_grid, pixel_slopes, unproject,
 from jaxpose.scenes.types import Params
 from jaxpose.scenes.voxel_blocks import (
     CELLS,
+    MEMORY,
     NODES,
     SAMPLED,
     BlockConfig,
     Blocks,
+    decoded,
+    encoded,
     sample_blocks,
     touched_blocks,
     with_blocks,
@@ -35,7 +38,6 @@ from jaxpose.scenes.voxel_blocks import (
 from jaxpose.slam.map.photometric import MapState
 from jaxpose.slam.observation import Image, Located, depth_sigma, locate
 
-_MEMORY = 100.0  # frames, at a depth of one metre: older ones are slowly forgotten
 _REACH = CELLS  # voxels to either side of a surface of which the wide-band distance knows
 _NEAREST = 3**0.5  # voxels: nodes of the cells that hold a surface
 _CUT = 0.98  # of a distance's reach: what is nearer to its end was cut off
@@ -111,7 +113,8 @@ def make_integrate(config: BlockConfig, camera: Camera):
                 T_cam_world, position(blocks.coords[row][None, None, None], jnp.asarray(nodes))
             )
             before = jax.lax.dynamic_index_in_dim(values, row, keepdims=False)
-            after = _integrated(before, points_cam, seen_at(locate(camera, points_cam)), reach)
+            seen = seen_at(locate(camera, points_cam))
+            after = encoded(config, _integrated(decoded(config, before), points_cam, seen, reach))
             return jax.lax.dynamic_update_index_in_dim(values, after, row, 0)
 
         # One block after the other, in place: what is in between stays small, whatever the map's size.
@@ -122,11 +125,11 @@ def make_integrate(config: BlockConfig, camera: Camera):
 
 
 def _integrated(
-    values: Float[Array, "*n 9"],
+    values: Float[Array, "*n 8"],
     points_cam: Float[Array, "*n 3"],
     seen: SurfaceObservation,
     reach: _Reach,
-) -> Float[Array, "*n 9"]:
+) -> Float[Array, "*n 8"]:
     """Nodes at points in camera axes with what an image says of them added."""
     distance, depth = seen.distance(points_cam), points_cam[..., 2]
     # How far behind a surface a node is goes by the optical axis, as little is known there at a grazing
@@ -143,9 +146,9 @@ def _integrated(
     found = jnp.concatenate([
         jnp.minimum(distance, reach.band)[..., None], seen.rgb, jnp.minimum(distance, reach.wide)[..., None]
     ], axis=-1)  # fmt: skip
-    mean = values[..., :5] + share[..., jnp.array([0, 1, 1, 1, 2])] * (found - values[..., :5])
-    valid = jnp.where(gain[..., 2] > 0, 1, values[..., 5])
-    return jnp.concatenate([mean, valid[..., None], jnp.minimum(total, _MEMORY)], axis=-1)
+    before = values[..., :SAMPLED]
+    mean = before + share[..., jnp.array([0, 1, 1, 1, 2])] * (found - before)
+    return jnp.concatenate([mean, jnp.minimum(total, MEMORY)], axis=-1)
 
 
 def grown_map(config: BlockConfig, state: MapState, points: Float[np.ndarray, "n 3"]) -> MapState:

@@ -11,7 +11,7 @@ from scipy.ndimage import map_coordinates
 
 from jaxpose.geometry import se3
 from jaxpose.geometry.camera import Camera
-from jaxpose.scenes.voxel_blocks import CELLS, BlockConfig, Blocks, packed
+from jaxpose.scenes.voxel_blocks import CELLS, SAMPLED, BlockConfig, Blocks, decoded, packed
 from jaxpose.slam.keyframes import Keyframe
 from jaxpose.slam.observation import back_project, locate, read_pixels
 
@@ -68,36 +68,42 @@ def _joined(parts: list[tuple[np.ndarray, ...]]) -> tuple[np.ndarray, ...]:
 def mesh(config: BlockConfig, blocks: Blocks, keyframes: Iterable[Keyframe], camera: Camera) -> Surface:
     """The zero of a map's signed distance by marching cubes, culled to what the keyframes have measured.
 
-    A point counts as seen where a keyframe has measured a depth within the map's truncation of it. Needs
-    scikit-image (extra `mesh`); ImportError without.
+    A point lies between two nodes that were both measured: behind a surface, where measuring ends, distances
+    change their sign too. It counts as seen where a keyframe has measured a depth within the map's truncation
+    of it. Needs scikit-image (extra `mesh`); ImportError without.
     """
     from skimage.measure import marching_cubes
 
-    coords, values = packed(blocks)
-    corners, triangles, colours, count = (
+    coords, stored = packed(blocks)
+    corners, triangles, colours, known, count = (
         [np.zeros((0, 3))],
         [np.zeros((0, 3), np.int64)],
         [np.zeros((0, 3))],
+        [np.zeros(0, bool)],
         0,
     )
-    distance = values[..., 0]
-    crossed = np.any(distance < 0, axis=(1, 2, 3)) & np.any(distance > 0, axis=(1, 2, 3))
-    for block, nodes in zip(coords[crossed], values[crossed], strict=True):
+    distance = stored[..., 0]
+    crossed = np.flatnonzero((distance.min(axis=(1, 2, 3)) < 0) & (distance.max(axis=(1, 2, 3)) > 0))
+    for row in crossed.tolist():
+        block, nodes = coords[row], decoded(config, stored[row])
         # In skimage's words the triangles' front then faces growing distances: free space.
         cells, faces, _, _ = marching_cubes(nodes[..., 0], level=0.0, gradient_direction="descent")
         rgb = [map_coordinates(nodes[..., k], cells.T, order=1, mode="nearest") for k in (1, 2, 3)]
+        ends = (tuple(end(cells).astype(int).T) for end in (np.floor, np.ceil))
+        known.append(np.all([nodes[end][:, SAMPLED] > 0 for end in ends], axis=0))
         corners.append(CELLS * block + cells.astype(np.float64))
         colours.append(np.stack(rgb, axis=-1))
         triangles.append(faces + count)
         count += len(cells)
-    cells, rgb, faces = (np.concatenate(x) for x in (corners, colours, triangles))
+    cells, rgb, known, faces = (np.concatenate(x) for x in (corners, colours, known, triangles))
     # Blocks share their outer nodes, and so the corners between them.
     place = _cubes(cells - np.min(cells, axis=0, initial=np.inf), 1 / 64)
     _, first, which = np.unique(place, return_index=True, return_inverse=True)
-    cells, rgb, faces = cells[first], rgb[first], np.asarray(which)[faces.astype(np.int64)]
+    cells, rgb, known = cells[first], rgb[first], known[first]
+    faces = np.asarray(which)[faces.astype(np.int64)]
     whole = (faces != np.roll(faces, 1, axis=1)).all(axis=1)  # no two corners have become one
     points = config.voxel * cells
-    measured = np.asarray(_seen(points, keyframes, camera, config.truncation))
+    measured = known & np.asarray(_seen(points, keyframes, camera, config.truncation))
     kept = whole & measured[faces].all(axis=1)
     used, faces = np.unique(faces[kept], return_inverse=True)
     colour = np.round(255 * np.clip(rgb[used], 0, 1)).astype(np.uint8)

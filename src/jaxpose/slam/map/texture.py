@@ -16,7 +16,7 @@ from jaxtyping import Float, Int, UInt8
 from jaxpose.geometry import se3
 from jaxpose.geometry.camera import Camera
 from jaxpose.scenes import SceneField
-from jaxpose.scenes.voxel_blocks import CELLS, BlockConfig, Blocks, block_at, trilinear_in_block
+from jaxpose.scenes.voxel_blocks import CELLS, BlockConfig, Blocks, block_at, decoded, trilinear_in_block
 from jaxpose.slam.keyframes import Keyframe
 from jaxpose.slam.map.integrate import in_view_test, seen_by
 from jaxpose.slam.observation import locate
@@ -48,7 +48,7 @@ def make_texture(
     pixels a piece of it fills.
     """
     count, capacity = int(blocks.count), blocks.coords.shape[0]
-    rows, near = _near_surface(config, np.asarray(blocks.values[:count, ..., 0]))
+    rows, near = _near_surface(config, np.asarray(blocks.values)[:count])
     if not len(rows):
         return Texture(np.zeros(capacity, np.int32), np.zeros((1, SIDE, SIDE, SIDE, 4), np.uint8))
     # The nodes near the surface of all tiles in turn, those of a few tiles next to each other in one chunk.
@@ -81,7 +81,8 @@ def textured(scene: SceneField, config: BlockConfig) -> SceneField:
         blocks, texture = params
         distance, rgb = scene.query(blocks, point, direction)
         row, local = block_at(config, blocks, point)
-        painted = trilinear_in_block(texture.tiles, texture.slot[row], _FINER * local, 4) / 255
+        as_float = lambda node: node.astype(local.dtype)
+        painted = trilinear_in_block(texture.tiles, texture.slot[row], _FINER * local, as_float) / 255
         colour, alpha = painted[:3], painted[3:]
         return distance, jnp.where(alpha > _PAINTED, colour / jnp.maximum(alpha, _PAINTED), rgb)
 
@@ -114,14 +115,15 @@ def _make_add(camera: Camera, near: float):
 
 
 def _near_surface(
-    config: BlockConfig, distance: Float[np.ndarray, "c 9 9 9"]
+    config: BlockConfig, values: Int[np.ndarray, "c 9 9 9 8"]
 ) -> tuple[Int[np.ndarray, " n"], np.ndarray]:
     """The rows of blocks with texture nodes near the surface, and which of their nodes these are."""
     thick = _THICKNESS * config.voxel / _FINER
-    candidates = np.flatnonzero(np.abs(distance).min(axis=(1, 2, 3)) < config.voxel)
     rows, near = [], []
-    for part in np.array_split(candidates, max(len(candidates) // 256, 1)):
-        fine = distance[part]
+    for part in np.array_split(np.arange(len(values)), max(len(values) // 256, 1)):
+        fine = decoded(config, values[part])[..., 0]
+        part = part[close := np.abs(fine).min(axis=(1, 2, 3)) < config.voxel]
+        fine = fine[close]
         for axis in (1, 2, 3):
             fine = _refined(fine, axis)
         mask = np.abs(fine) < thick
