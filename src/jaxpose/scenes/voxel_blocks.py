@@ -195,7 +195,7 @@ def with_blocks(
     more than `budget` [bytes], old and new together.
     """
     table, coords, count = np.asarray(blocks.table), blocks.coords, int(blocks.count)
-    bricks, corner, used = _with_bricks(blocks, np.unique(wanted // _BRICK, axis=0))
+    bricks, corner, used = _with_bricks(blocks, wanted // _BRICK)
     table = np.pad(table, [(0, _room_for(used, len(table)) - len(table)), *[(0, 0)] * 3])
     place = (bricks[tuple((wanted // _BRICK - corner).T)], *(wanted % _BRICK).T)
     is_new = table[place] == 0
@@ -221,7 +221,10 @@ def with_blocks(
 def _with_bricks(
     blocks: Blocks, wanted: Int[np.ndarray, "m 3"]
 ) -> tuple[Int[np.ndarray, "s s s"], Int[np.ndarray, "3"], int]:
-    """The upper level of the table with these bricks of space, its corner, and how many bricks there are."""
+    """The upper level of the table with these bricks of space, its corner, and how many bricks there are.
+
+    They are numbered as they come, so that blocks in one order have one table.
+    """
     bricks, corner = np.array(blocks.bricks), np.asarray(blocks.corner)
     lower, upper = (wanted - corner).min(axis=0), (wanted - corner).max(axis=0)
     while (lower < 0).any() or (upper >= len(bricks)).any():  # twice the side, the old one in the middle
@@ -229,7 +232,8 @@ def _with_bricks(
         bricks = np.pad(bricks, half)
         corner, lower, upper = corner - half, lower + half, upper + half
     used = int(bricks.max(initial=0)) + 1
-    place = tuple((wanted - corner).T)
+    first = np.sort(np.unique(wanted, axis=0, return_index=True)[1])
+    place = tuple((wanted[first] - corner).T)
     new = bricks[place] == 0
     bricks[tuple(x[new] for x in place)] = np.arange(used, used + new.sum())
     return bricks, corner, used + int(new.sum())
@@ -285,7 +289,7 @@ def blocks_of_grid(config: GridConfig, values: Float[np.ndarray, "x y z 4"]) -> 
 def of_distance_and_colour(
     config: BlockConfig, values: Float[np.ndarray, "n 9 9 9 4"]
 ) -> Int[np.ndarray, "n 9 9 9 8"]:
-    """Nodes of distance [m] and colour, known everywhere, as they are stored; without a wide-band distance."""
+    """Nodes of distance [m] and colour, known everywhere, as they are stored; no wide-band distance."""
     values = np.asarray(values, np.float32)
     unknown, known = np.zeros_like(values[..., :1]), np.ones_like(values[..., :2])
     return np.asarray(

@@ -35,6 +35,9 @@ from jaxpose.slam.tracking.register import Tracked
 from jaxpose.slam.tracking.relocalise import CENTRES, FOUND_SIGMA
 from jaxpose.slam.types import Frames, Motion, SlamState, TrackingStatus
 
+# What is kept of a registration.
+_KEPT = "iterations", "loss", "depth_error", "colour_error", "valid", "sigma", "covariance", "line_delay"
+
 
 def next_pose(
     state: SlamState,
@@ -86,8 +89,7 @@ def next_pose(
     if seen is not None:
         found = np.asarray(tracked.T_ref_body), np.asarray(tracked.information)
         frames = frames.put(-1, feature_nis=feature_nis(state, frames, used, seen, *found))
-    weak = (np.asarray(tracked.sigma) > policy.weak).any()
-    status = TrackingStatus.WEAK if weak else TrackingStatus.TRACKED
+    status = registered_status(policy, tracked)
     if (
         not held
         and not is_blank(frame)
@@ -122,6 +124,26 @@ def registered_near(
     expected = constant_velocity(expected_motion(state), T_ref_body, np.diag(np.repeat(sigma**2, 3)))
     generator, key = np.random.default_rng([state.config.seed, i]), jax.random.key(state.config.seed)
     return _track(state, frames, expected, image, generator, jax.random.fold_in(key, i))
+
+
+def registered_status(policy: RecoveryConfig, tracked: Tracked) -> TrackingStatus:
+    """How a frame was found whose registration is believed: weak, where the image says little."""
+    weak = (np.asarray(tracked.sigma) > policy.weak).any()
+    return TrackingStatus.WEAK if weak else TrackingStatus.TRACKED
+
+
+def with_registration(
+    frames: Frames,
+    i: int,
+    T_world_body: Float[np.ndarray, "4 4"],
+    status: TrackingStatus,
+    tracked: Tracked | None,
+) -> Frames:
+    """The frames with the pose of one of them, and what is kept of its registration, if there was one."""
+    pose = T_world_body.copy()
+    pose[:3, :3] = rigid.nearest_rotation(pose[:3, :3])  # float32 adds up
+    values = {} if tracked is None else {name: getattr(tracked, name) for name in _KEPT}
+    return frames.put(i, T_world_body=pose, status=status, **values)
 
 
 def unrolled(state: SlamState, predicted: MotionPrediction, frame: Frame) -> Frame:
@@ -174,15 +196,6 @@ def _update_state(
     config, i, dt, predicted = state.config, frames.count - 1, prediction.dt, prediction.T_ref_body[-1]
     registered = None if status == TrackingStatus.LOST else tracked
     T_ref_body = predicted if registered is None else np.asarray(registered.T_ref_body, np.float64)
-    T_world_ref = frames.T_world_body[i - 1]
-    T_world_body = T_world_ref @ T_ref_body
-    T_world_body[:3, :3] = rigid.nearest_rotation(T_world_body[:3, :3])  # float32 adds up
-    values = {"T_world_body": T_world_body, "status": status}
-    if tracked is not None:
-        names = (
-            "iterations", "loss", "depth_error", "colour_error", "valid", "sigma", "covariance", "line_delay",
-        )  # fmt: skip
-        values |= {name: getattr(tracked, name) for name in names}
     sure = registered is not None and status <= TrackingStatus.WEAK and frames.last_found == i - 1
     fade = np.exp(-dt / config.recovery.fading_s) if status == TrackingStatus.LOST else 1.0
     velocity_body = end_velocity(dt, T_ref_body, prediction.readings, speed=config.uses_accelerometer)
@@ -191,7 +204,8 @@ def _update_state(
         twist=fade * rigid.log(T_ref_body) / dt,
         velocity_body=velocity_body if config.uses_accelerometer else fade * velocity_body,
     )
-    state = state._replace(frames=frames.put(i, **values), motion=motion)
+    frames = with_registration(frames, i, frames.T_world_body[i - 1] @ T_ref_body, status, tracked)
+    state = state._replace(frames=frames, motion=motion)
     if registered is None:
         return state
     return state._replace(params=registered.params, exposure=registered.exposure)

@@ -16,13 +16,12 @@ from jaxpose.geometry import rigid
 from jaxpose.slam.keyframes import FrameReader
 from jaxpose.slam.loops.rebuild import posed, rebuilt_map
 from jaxpose.slam.observation import to_device
-from jaxpose.slam.tracker import registered_near
+from jaxpose.slam.tracker import registered_near, registered_status, with_registration
 from jaxpose.slam.tracking.register import Tracked
-from jaxpose.slam.types import Frames, SlamState, TrackingStatus
+from jaxpose.slam.types import Frames, SlamState
 
 _OFF = 0.02, 0.01  # [m, rad] one sigma of a pose that is in no doubt
 _FASTER = 0.1  # [m/s, rad/s] one sigma of the speed between frames that are in none
-_FOUND = "loss", "depth_error", "colour_error", "valid", "sigma", "covariance"  # of a registration
 
 
 def refined(
@@ -62,12 +61,8 @@ def _again(state: SlamState, frames: Frames, i: int, known: Int[np.ndarray, " n"
     tracked = registered_near(state, i, T_world_body, sigma, to_device(frame))
     if not _is_good(state, i, known, tracked):
         return frames
-    weak = (np.asarray(tracked.sigma) > state.config.recovery.weak).any()
     pose = state.frames.T_world_body[i - 1] @ np.asarray(tracked.T_ref_body, np.float64)
-    pose[:3, :3] = rigid.nearest_rotation(pose[:3, :3])
-    status = TrackingStatus.WEAK if weak else TrackingStatus.TRACKED
-    found = {name: getattr(tracked, name) for name in _FOUND}
-    return frames.put(i, T_world_body=pose, status=status, **found)
+    return with_registration(frames, i, pose, registered_status(state.config.recovery, tracked), tracked)
 
 
 def _guess(
