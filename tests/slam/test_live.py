@@ -1,6 +1,9 @@
 """Frames that come one by one: the same as a recording, states that stay usable, bad frames refused."""
 
+from functools import partial
+
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -9,7 +12,9 @@ from jaxpose.datasets.synthetic import RoomConfig, room
 from jaxpose.datasets.types import select
 from jaxpose.errors import DataError
 from jaxpose.imu import Imu
-from jaxpose.slam import SlamConfig, TrackingStatus
+from jaxpose.scenes.voxel_blocks import sample_blocks
+from jaxpose.slam import SlamConfig, TrackingStatus, checkpoint
+from jaxpose.slam.map.backend import seen_points
 
 
 @pytest.fixture(scope="module")
@@ -83,3 +88,29 @@ def test_bad_frames_are_refused_by_the_argument(walk):
         slam.init(walk.camera, T_body_cam=2 * np.eye(4))
     with pytest.raises(ValueError, match="expected duration_s"):
         slam.init(walk.camera, SlamConfig(frame="intrinsic"))
+
+
+def test_a_budget_too_small_for_the_first_frame_is_one_line(walk):
+    state = slam.init(walk.camera, SlamConfig(voxel=0.05, map_budget_gb=1e-5))
+    with pytest.raises(DataError, match=r"^map_budget_gb: expected 0\.0\d+ for the first frame, got 1e-05$"):
+        slam.step(state, *walk.read(0), 0.0)
+
+
+@pytest.mark.slow
+def test_a_map_that_reaches_its_budget_goes_on_with_coarser_voxels(walk, tmp_path):
+    whole = live(walk, SlamConfig(voxel=0.05), 0.0, T_world_cam=walk.T_world_cam[0])
+    counts = [int(state.map.params.count) for state in whole[1:]]
+    assert counts[-1] > counts[0] + 1
+    config = SlamConfig(voxel=0.05, map_budget_gb=(counts[0] + 1) * 9**3 * 16 / 1e9)
+    state = live(walk, config, 0.0, T_world_cam=walk.T_world_cam[0])[-1]
+    at = int(np.flatnonzero(np.array(counts) > counts[0] + 1)[0])
+    assert state.coarser_at.tolist() == [at] and state.grid.voxel == 0.1
+    assert len(state.map.params.values) == counts[0] + 1
+    T_world_cam = state.frames.T_world_body[-1] @ state.T_body_cam
+    points = seen_points(walk.read(4), walk.camera, T_world_cam, step=4)
+    at_points = jax.vmap(partial(sample_blocks, state.grid, state.map.params))
+    distance = np.asarray(at_points(jnp.asarray(points, jnp.float32)))
+    assert np.median(np.abs(distance[:, 0])) < 0.02 and np.mean(distance[:, 5] == 1) > 0.8
+    checkpoint.save(tmp_path / "c.npz", state)
+    kept = checkpoint.load(tmp_path / "c.npz", walk, config)
+    assert kept.coarser_at.tolist() == [at] and kept.grid == state.grid

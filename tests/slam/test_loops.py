@@ -19,7 +19,7 @@ from jaxpose.slam.config import LoopConfig
 from jaxpose.slam.keyframes import seen_shares
 from jaxpose.slam.loops.closure import corrected, followed, is_same_place, poses_by_motions
 from jaxpose.slam.loops.drift import drift_to_last, may_be_doubled
-from jaxpose.slam.loops.rebuild import posed, rebuilt_map
+from jaxpose.slam.loops.rebuild import rebuilt
 from jaxpose.slam.loops.refine import refined
 from jaxpose.slam.loops.types import no_loops
 from jaxpose.slam.loops.verify import Comparison, Verified, verify
@@ -175,8 +175,7 @@ def test_loops_straighten_a_bent_run_and_its_map(again, tmp_path):
     bent = frames._replace(T_world_body=bend @ frames.T_world_body, T_odometry=bend @ frames.T_world_body)
     state = state._replace(frames=bent)
     keyframes, lap, loops = np.flatnonzero(frames.keyframe), 12.5 / 2, state.loops
-    at_keyframes = (posed(state, recording.read(i), i) for i in keyframes.tolist())
-    state = state._replace(map=rebuilt_map(own_map(state), at_keyframes))
+    state = rebuilt(own_map(state), keyframes, recording.read)
     for b in keyframes[recording.t[keyframes] > lap + 0.2][::4]:
         a = int(keyframes[np.argmin(np.abs(recording.t[keyframes] - recording.t[b] + lap))])
         images, seen = pairs(recording, a, int(b))

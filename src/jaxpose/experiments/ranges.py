@@ -52,6 +52,7 @@ RANGES = {
     "line_delay_us": Range(-1e6, 1e6),  # below 0: read from the last row to the first
     "wait_s": _POSITIVE,
     "voxel": Range(0, 100, True),
+    "map_budget_gb": Range(0, 4, True),
     "seed": Range(0, 2**32 - 1),
     "edge": Range(0, 32768),
     "gain": _RELATIVE,

@@ -50,8 +50,15 @@ class BlockConfig:
             )
 
 
+_MOST_BYTES = 2**32  # of a pool: 32 bits count no more numbers
+
+
 class PoolFull(Exception):
-    """More blocks are needed than a budget of memory holds."""
+    """More blocks are needed than a budget of memory holds; `needed` [bytes] is what they take."""
+
+    def __init__(self, needed: int):
+        super().__init__(f"a pool of {needed} bytes")
+        self.needed = needed
 
 
 class Blocks(NamedTuple):
@@ -84,9 +91,18 @@ def voxel_blocks(config: BlockConfig) -> SceneField:
 
 
 def empty_blocks(
-    config: BlockConfig, *, capacity: int = _CAPACITY, side: int = _SIDE, bricks: int = _BRICKS
+    config: BlockConfig,
+    *,
+    capacity: int = _CAPACITY,
+    side: int = _SIDE,
+    bricks: int = _BRICKS,
+    budget: float = np.inf,
 ) -> Blocks:
-    """Blocks of a scene in which nothing was seen; the table is centred on the world's origin."""
+    """Blocks of a scene in which nothing was seen; the table is centred on the world's origin.
+
+    The pool holds `capacity` blocks, or as many as `budget` [bytes] allows.
+    """
+    capacity = int(min(capacity, max(budget // _ROW_BYTES, 1)))
     return Blocks(
         jnp.zeros((side, side, side), jnp.int32),
         jnp.full(3, -side // 2, jnp.int32),
@@ -202,7 +218,7 @@ def with_blocks(
     new, values = wanted[is_new], blocks.values
     if not len(new):
         return blocks
-    capacity = _room_for(count + len(new), len(values), budget / _ROW_BYTES)
+    capacity = _room_for(count + len(new), len(values), min(budget, _MOST_BYTES - 1) / _ROW_BYTES)
     if capacity > len(values):
         values = _enlarged(values, _free(config), capacity)
     table, coords = np.array(table), np.pad(np.asarray(coords), [(0, capacity - len(coords)), (0, 0)])
@@ -244,7 +260,7 @@ def _room_for(count: int, room: int, most: float = np.inf) -> int:
     while room < count:
         grown = int(min(_GROWTH * room, most - room))
         if grown <= room:
-            raise PoolFull
+            raise PoolFull(count * _ROW_BYTES)
         room = grown
     return room
 

@@ -8,6 +8,7 @@ from jaxpose.fields import PoseNetConfig
 from jaxpose.imu import ADIS16448, ImuNoise
 
 MOST_LINE_DELAY_US = 1000.0  # half a second for an image of 500 rows: no camera is as slow
+MOST_BUDGET_GB = 4.0  # 32 bits count as many numbers of 16 bits, rounded
 ImuMode = Literal["none", "loose", "tight", "accelerometer", "combined"]
 FrameName = Literal["anchored", "default", "world", "random", "intrinsic"]
 
@@ -181,6 +182,9 @@ class SlamConfig:
     loop: LoopConfig = LoopConfig()
     map_every_s: float = 0.15  # [s] between mapping steps
     voxel: float | None = None  # [m] size of the map's cells; None: from the size of the room
+    # [GB] of memory for the blocks of the map, also while they grow; with more to hold, it is made anew of
+    # voxels twice as wide.
+    map_budget_gb: float = 2.0
     hold_out: int = 0  # every n-th frame is tracked but never mapped, to measure the map on; 0: none
     keyframe_overlap: float = 0.9  # a frame that shares less with every keyframe becomes one
     imu_noise: ImuNoise = ADIS16448
@@ -192,8 +196,16 @@ class SlamConfig:
             raise ValueError(
                 f"line_delay_us: expected at most {MOST_LINE_DELAY_US:g} us, got {self.line_delay_us}"
             )
+        if not 0 < self.map_budget_gb <= MOST_BUDGET_GB:
+            most, got = MOST_BUDGET_GB, self.map_budget_gb
+            raise ValueError(f"map_budget_gb: expected a number above 0, at most {most:g}, got {got}")
         if self.voxel is not None and not 0 < self.voxel < math.inf:
             raise ValueError(f"voxel: expected a positive number, got {self.voxel}")
+
+    @property
+    def map_budget(self) -> float:
+        """Memory for the map's blocks [bytes]."""
+        return 1e9 * self.map_budget_gb
 
     @property
     def uses_gyroscope(self) -> bool:

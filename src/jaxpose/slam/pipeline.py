@@ -27,16 +27,10 @@ from jaxpose.slam.config import SlamConfig
 from jaxpose.slam.initial_pose import first_pose, upright_pose
 from jaxpose.slam.keyframes import FrameReader, coarse_depth, keyframe_images, thumbnail
 from jaxpose.slam.loops.closure import with_loops
+from jaxpose.slam.loops.rebuild import with_room
 from jaxpose.slam.loops.refine import refined
 from jaxpose.slam.loops.types import Loops, no_loops
-from jaxpose.slam.map.backend import (
-    as_blocks,
-    framed_field,
-    grow_to_fit,
-    is_mapped,
-    map_frame,
-    seen_points,
-)
+from jaxpose.slam.map.backend import as_blocks, framed_field, is_mapped, map_frame, seen_points
 from jaxpose.slam.map.texture import Texture, make_texture, textured
 from jaxpose.slam.observation import to_device
 from jaxpose.slam.readings import all_readings, joined, readings_until
@@ -65,6 +59,7 @@ class SlamResult(NamedTuple):
     T_world_cam_odometry: Float[np.ndarray, "n 4 4"]  # motions as tracked, put together without loops
     frames: Frames
     loops: Loops
+    coarser_at: Int[np.ndarray, " c"]  # frames at which voxels became twice as wide (`config.map_budget_gb`)
     scene: SceneField
     map_config: BlockConfig
     scene_params: tuple[Blocks, Texture]
@@ -131,6 +126,7 @@ def init(
         keyframe_features=(),
         loops=no_loops(),
         settled=0,
+        coarser_at=np.zeros(0, int),
         images=(),
         readings=(),
         grid=None,
@@ -303,7 +299,7 @@ def _advance(state: SlamState, frame: Frame, t: float, imu: Imu | None, read: Fr
         return state
     away = np.linalg.norm(points - T_world_cam[:3, 3], axis=1)
     state = state._replace(max_depth=max(state.max_depth, 1.2 * float(np.percentile(away, 99))))
-    state = grow_to_fit(frame, points, state)
+    state = with_room(frame, points, state, read)
     image = image._replace(exposure=state.exposure)
     state = map_frame(state, image, points, read, generator, map_key)
     if state.frames.keyframe[i]:
@@ -363,6 +359,7 @@ def _finish(state: SlamState, read: FrameReader, imu: Imu | None) -> SlamResult:
         T_world_cam_odometry=frames.T_odometry @ state.T_body_cam,
         frames=frames,
         loops=state.loops,
+        coarser_at=state.coarser_at,
         scene=textured(voxel_blocks(config), config),
         map_config=config,
         scene_params=(blocks, jax.tree.map(jnp.asarray, texture)),

@@ -27,7 +27,7 @@ FEWEST_FRAMES = 3  # three camera centres are the fewest that an alignment can b
 # The options of the first screen of help.
 GROUPS = {
     "data": ("data", "recorded_hz", "rate_hz", "imu_file", "imu_extrinsics"),
-    "method": ("slam.imu", "compare", "slam.voxel", "slam.seed"),
+    "method": ("slam.imu", "compare", "slam.voxel", "slam.map_budget_gb", "slam.seed"),
     "run": ("out", "name", "resume", "smoke", "json"),
 }
 # What tracking sets by itself, or cannot use.
@@ -143,6 +143,8 @@ class Options:
             check_unused(self, ("slam.loops",), "without features and a fused map")
         if not replace(slam, refine="all").uses_refinement:
             check_unused(self, ("slam.refine",), "with --track.method or --map.method gradient")
+        if slam.map.method == "gradient":
+            check_unused(self, ("slam.map_budget_gb",), "with --map.method gradient")
         if slam.map.method == "fused":
             check_unused(self, [f"slam.map.{n}" for n in _RENDERED_MAPPING], "with --map.method fused")
 

@@ -29,6 +29,8 @@ from jaxpose.slam.pipeline import run as track
 
 _END = Update("fitting the continuous trajectory, texturing the map")
 
+_COMPILING = 2  # frames of a run, the first ones
+
 Errors = Float[np.ndarray, " n"]  # [m] translation error of every frame; NaN without ground truth
 
 
@@ -129,6 +131,8 @@ def _single(
     def on_frame(progress: Progress) -> None:
         keep(progress)
         on_update(tracking_update(mode, progress))
+        if progress.index < _COMPILING or progress.index == progress.count - 1:
+            run_folder.give_back_memory()
         if progress.index == progress.count - 1:
             on_update(_END)
 

@@ -69,7 +69,8 @@ def write_run(
     )
     atomic.write_json(folder / "config.json", options)
     on_update(Update("writing the point cloud and the mesh"))
-    notes = (*recording.notes, *first_pose(recording).notes, *_write_surface(folder, recording, result))
+    notes = (*recording.notes, *first_pose(recording).notes, *_coarser_notes(options, result))
+    notes = (*notes, *_write_surface(folder, recording, result))
     on_update(Update("rendering the map"))
     render = renderer(recording, result)
     quality = map_quality(result, render)
@@ -78,6 +79,16 @@ def write_run(
     calibration = {} if result.posterior is None else {"calibration": calibration_numbers(result.posterior)}
     found = {**tracking_numbers(result), **measured.numbers(), **calibration, "map": quality, "notes": notes}
     return found, np.full(len(recording.t), np.nan) if errors is None else errors.translation_m
+
+
+def _coarser_notes(options: Options, result: SlamResult) -> tuple[str, ...]:
+    """Where the map has reached its budget."""
+    voxels = result.map_config.voxel * 0.5 ** np.arange(len(result.coarser_at))[::-1]
+    budget = f"the map reached --map-budget-gb {options.slam.map_budget_gb:g}"
+    return tuple(
+        f"frame {i}: {budget} and was made anew from keyframes, with voxels of {100 * voxel:.1f} cm"
+        for i, voxel in zip(result.coarser_at.tolist(), voxels.tolist(), strict=True)
+    )
 
 
 def _write_trajectory(folder: Path, source: Source, result: SlamResult) -> None:

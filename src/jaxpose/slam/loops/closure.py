@@ -7,7 +7,6 @@ keyframes by a pose graph, the frames between them with them, and the map is int
 
 from typing import NamedTuple
 
-import jax
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -17,7 +16,7 @@ from jaxpose.geometry import rigid
 from jaxpose.slam.config import LoopConfig
 from jaxpose.slam.keyframes import FrameReader, seen_shares, unlikeness
 from jaxpose.slam.loops.drift import drift_to_last, may_be_doubled, motion_sigmas
-from jaxpose.slam.loops.rebuild import posed, rebuilt_map
+from jaxpose.slam.loops.rebuild import rebuilt
 from jaxpose.slam.loops.verify import Verified, verify
 from jaxpose.slam.map.backend import seen_points
 from jaxpose.slam.tracking.features import locate_camera
@@ -207,8 +206,7 @@ def corrected(state: SlamState, frame: Frame | None, read: FrameReader) -> SlamS
     last, loops = frames.count - 1, state.loops._replace(believed=believed)
     state = state._replace(frames=after, motion=motion, loops=loops, settled=last)
     now = read if frame is None else lambda i: frame if i == last else read(i)
-    made = rebuilt_map(state, (posed(state, now(i), i) for i in keyframes.tolist()))
-    return state._replace(map=jax.block_until_ready(made))
+    return rebuilt(state, keyframes, now)
 
 
 def _edges(state: SlamState, keyframes: Int[np.ndarray, " k"]) -> Edges:

@@ -1,19 +1,19 @@
 """The map made anew from frames at the poses that they have by now."""
 
-from collections.abc import Iterable
 from functools import partial
-from itertools import islice
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxpose.datasets.types import Frame
+from jaxpose.errors import DataError
 from jaxpose.geometry import rigid
-from jaxpose.scenes.voxel_blocks import BlockConfig, Blocks
-from jaxpose.slam.map.backend import allocation_points, map_backend
+from jaxpose.scenes.voxel_blocks import BlockConfig, Blocks, PoolFull
+from jaxpose.slam.keyframes import FrameReader
+from jaxpose.slam.map.backend import allocation_points, grow_to_fit, map_backend
 from jaxpose.slam.map.integrate import grown_map
 from jaxpose.slam.map.photometric import MapState
 from jaxpose.slam.observation import to_device
@@ -31,25 +31,65 @@ class Posed(NamedTuple):
     T_world_cam: Float[np.ndarray, "4 4"]
 
 
-def rebuilt_map(state: SlamState, frames: Iterable[Posed]) -> MapState:
-    """The map that integrating some frames makes, written over the old one.
+def rebuilt(state: SlamState, chosen: Int[np.ndarray, " k"], read: FrameReader) -> SlamState:
+    """The run with the map that integrating some of its frames makes, written over the old one.
 
     Args:
         state: a run that maps by integration. Its map is no longer usable.
-        frames: what to integrate; a few of them are held at a time.
+        chosen: (k,) which frames.
+        read: gives them; a few are held at a time.
 
     Returns:
-        The map; nothing is compiled for it, unless it needs more room than before.
+        The state; nothing is compiled for it, unless it needs more room than before. Where there is none, its
+        voxels are twice as wide.
     """
     assert isinstance(state.grid, BlockConfig) and state.map is not None
-    made, update, left = MapState(_emptied(state.map.params), ()), map_backend(state).update, iter(frames)
-    while some := list(islice(left, _TOGETHER)):
+    made, update, left = MapState(_emptied(state.map.params), ()), map_backend(state).update, chosen.tolist()
+    while left:
+        some, left = [posed(state, read(i), i) for i in left[:_TOGETHER]], left[_TOGETHER:]
         measured = [allocation_points(x.frame, state.camera, x.T_world_cam) for x in some]
-        made = grown_map(state.grid, made, np.concatenate(measured))
+        try:
+            made = grown_map(state.grid, made, np.concatenate(measured), state.config.map_budget)
+        except PoolFull:
+            return rebuilt(_coarser(state._replace(map=made)), chosen, read)
         for x in some:
             image = to_device(x.frame)._replace(exposure=jnp.asarray(x.exposure, jnp.float32))
             made = update(made, image, jnp.asarray(x.T_world_cam, jnp.float32))
-    return made
+    return state._replace(map=jax.block_until_ready(made))
+
+
+def with_room(
+    frame: Frame, points: Float[np.ndarray, "n 3"], state: SlamState, read: FrameReader
+) -> SlamState:
+    """The state with a map that holds what its last frame has measured, coarser if there is no room.
+
+    Args:
+        frame: the last one.
+        points: world points of it [m].
+        state: a run. Its map is no longer usable, if it has to be made anew.
+        read: keyframes before.
+
+    Returns:
+        The state.
+
+    Raises:
+        DataError: where the budget does not hold the first frame.
+    """
+    try:
+        return grow_to_fit(frame, points, state)
+    except PoolFull as full:
+        keyframes, gb = np.flatnonzero(state.frames.keyframe), full.needed / 1e9
+        if not len(keyframes):
+            budget = state.config.map_budget_gb
+            raise DataError(f"map_budget_gb: expected {gb:.2g} for the first frame, got {budget:g}") from None
+    return with_room(frame, points, rebuilt(_coarser(state), keyframes, read), read)
+
+
+def _coarser(state: SlamState) -> SlamState:
+    """The state with voxels twice as wide, which its map does not have yet."""
+    assert isinstance(state.grid, BlockConfig)
+    grid = BlockConfig(2 * state.grid.voxel, 2 * state.grid.truncation)
+    return state._replace(grid=grid, coarser_at=np.append(state.coarser_at, state.frames.count - 1))
 
 
 @partial(jax.jit, donate_argnums=0)

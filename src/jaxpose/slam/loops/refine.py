@@ -7,14 +7,13 @@ map is made anew.
 
 from collections.abc import Callable
 
-import jax
 import numpy as np
 from jaxtyping import Float, Int
 
 from jaxpose.datasets.types import Frame
 from jaxpose.geometry import rigid
 from jaxpose.slam.keyframes import FrameReader
-from jaxpose.slam.loops.rebuild import posed, rebuilt_map
+from jaxpose.slam.loops.rebuild import posed, rebuilt
 from jaxpose.slam.observation import to_device
 from jaxpose.slam.tracker import registered_near, registered_status, with_registration
 from jaxpose.slam.tracking.register import Tracked
@@ -47,9 +46,7 @@ def refined(
     state = state._replace(frames=frames)
     if not everything:
         return state
-    mapped = np.flatnonzero(frames.mapped).tolist()
-    made = rebuilt_map(state, (posed(state, read(i), i) for i in mapped))
-    return state._replace(map=jax.block_until_ready(made))
+    return rebuilt(state, np.flatnonzero(frames.mapped), read)
 
 
 def _again(state: SlamState, frames: Frames, i: int, known: Int[np.ndarray, " n"], frame: Frame) -> Frames:

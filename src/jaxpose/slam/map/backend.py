@@ -65,7 +65,8 @@ def map_backend(state: SlamState) -> MapBackend:
     framed = framed_field(config)
     weights = IMU_WEIGHTS[config.imu] if config.track.method == "gradient" else IMU_WEIGHTS["none"]
     line_delay = "line-delay" in config.estimate
-    return _map_backend(state.camera, config.track, config.map, framed, weights, size, line_delay)
+    budget = config.map_budget
+    return _map_backend(state.camera, config.track, config.map, framed, weights, size, line_delay, budget)
 
 
 def framed_field(config: SlamConfig) -> FramedField | None:
@@ -85,11 +86,15 @@ def _map_backend(
     weights: ImuWeights,
     size: BlockConfig | GridConfig,
     line_delay: bool,
+    budget: float,
 ) -> MapBackend:
     scale = {"band": size.truncation, "width": size.truncation / 8}
     if isinstance(size, BlockConfig):
         scene, update = voxel_blocks(size), make_integrate(size, camera)
-        start, sample = lambda: MapState(empty_blocks(size), ()), partial(sample_map, size)
+        start, sample = (
+            lambda: MapState(empty_blocks(size, budget=budget), ()),
+            partial(sample_map, size),
+        )
     else:
         config = replace(config, sample=replace(config.sample, **scale))
         scene = grid(size)
@@ -143,7 +148,7 @@ def seen_points(
 def grow_to_fit(frame: Frame, points: Float[np.ndarray, "n 3"], state: SlamState) -> SlamState:
     """The state with a map that holds what its last frame has measured; `points` are some of it.
 
-    A grid does not grow for a few stray points.
+    A grid does not grow for a few stray points. PoolFull where blocks need more than the budget.
     """
     bounds = np.percentile(points, [1, 99], axis=0)
     fused = state.config.map.method == "fused"
@@ -155,7 +160,7 @@ def grow_to_fit(frame: Frame, points: Float[np.ndarray, "n 3"], state: SlamState
     if isinstance(state.grid, BlockConfig):
         T_world_cam = state.frames.T_world_body[-1] @ state.T_body_cam
         measured = allocation_points(frame, state.camera, T_world_cam)
-        return state._replace(map=grown_map(state.grid, state.map, measured))
+        return state._replace(map=grown_map(state.grid, state.map, measured, state.config.map_budget))
     assert state.grid is not None
     lower, upper = bounds
     if (lower >= state.grid.lower).all() and (upper <= state.grid.upper).all():

@@ -151,10 +151,12 @@ def _integrated(
     return jnp.concatenate([mean, jnp.minimum(total, MEMORY)], axis=-1)
 
 
-def grown_map(config: BlockConfig, state: MapState, points: Float[np.ndarray, "n 3"]) -> MapState:
-    """The map with blocks wherever measured points [m] will change it."""
+def grown_map(
+    config: BlockConfig, state: MapState, points: Float[np.ndarray, "n 3"], budget: float = np.inf
+) -> MapState:
+    """The map with blocks wherever measured points [m] will change it; PoolFull beyond `budget` [bytes]."""
     touched = touched_blocks(config, points, _REACH * config.voxel)
-    return state._replace(params=with_blocks(config, state.params, touched))
+    return state._replace(params=with_blocks(config, state.params, touched, budget=budget))
 
 
 def sample_map(config: BlockConfig, params: Params, fusion_state: Any, point: Float[Array, "3"]) -> MapSample:

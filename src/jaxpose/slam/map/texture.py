@@ -26,6 +26,7 @@ SIDE = _FINER * CELLS + 1  # nodes along each side of a tile, which is a block w
 _THICKNESS = 1.2  # texture cells to either side of the surface
 _SAME = 2.0  # cells of the map that a measured surface may be off the map's
 _PAINTED = 0.25  # weight of painted nodes around a point from which on they give its colour
+_TOGETHER = 1 << 18  # nodes that are written to their tiles in one go
 _NEIGHBOURS = 64  # tiles whose nodes are looked at, or skipped, in one go
 
 
@@ -48,27 +49,31 @@ def make_texture(
     pixels a piece of it fills.
     """
     count, capacity = int(blocks.count), blocks.coords.shape[0]
-    rows, near = _near_surface(config, np.asarray(blocks.values)[:count])
+    rows, tile, within = _near_surface(config, np.asarray(blocks.values)[:count])
     if not len(rows):
         return Texture(np.zeros(capacity, np.int32), np.zeros((1, SIDE, SIDE, SIDE, 4), np.uint8))
     # The nodes near the surface of all tiles in turn, those of a few tiles next to each other in one chunk.
-    tile, *within = np.nonzero(near)
-    index = _FINER * CELLS * np.asarray(blocks.coords)[rows][tile] + np.stack(within, axis=-1)
     size = max(len(tile) * _NEIGHBOURS // len(rows), 1)
-    chunks = np.pad(index, [(0, -len(index) % size), (0, 0)], mode="edge").reshape(-1, size, 3)
-    points = np.float32(config.voxel / _FINER) * chunks.astype(np.float32)
-    box = np.stack([points.min(axis=1), points.max(axis=1)])
-    corners = np.stack([box[list(k), :, [0, 1, 2]].T for k in np.ndindex(2, 2, 2)], axis=1)
-    add, total = _make_add(camera, _SAME * config.voxel), jnp.zeros((*points.shape[:2], 4))
-    on_device = jnp.asarray(points), jnp.asarray(corners)
+    index = np.empty((-(-len(tile) // size), size, 3), np.int32)
+    flat = index.reshape(-1, 3)
+    np.add(_FINER * CELLS * np.asarray(blocks.coords)[rows][tile], within, out=flat[: len(tile)])
+    flat[len(tile) :] = flat[len(tile) - 1]
+    ends = np.stack([index.min(axis=1), index.max(axis=1)])
+    corners = np.stack([ends[list(k), :, [0, 1, 2]].T for k in np.ndindex(2, 2, 2)], axis=1)
+    side, total = config.voxel / _FINER, jnp.zeros((*index.shape[:2], 4))
+    add, nodes = _make_add(camera, side, _SAME * config.voxel), (jnp.asarray(index), jnp.asarray(corners))
+    del index, flat
     for keyframe in keyframes:
-        total = add(total, *on_device, keyframe.image, jnp.asarray(keyframe.T_world_cam, jnp.float32))
-    rgb, weight = np.split(np.asarray(total).reshape(-1, 4)[: len(index)], [3], axis=-1)
-    there = weight[:, 0] > 0
+        total = add(total, *nodes, keyframe.image, jnp.asarray(keyframe.T_world_cam, jnp.float32))
     tiles = np.zeros((len(rows) + 1, SIDE, SIDE, SIDE, 4), np.uint8)
-    place = (tile[there] + 1, *(x[there] for x in within))
-    tiles[(*place, slice(0, 3))] = np.round(255 * rgb[there] / weight[there])
-    tiles[(*place, 3)] = 255
+    painted = np.asarray(total).reshape(-1, 4)
+    for start in range(0, len(tile), _TOGETHER):
+        some = slice(start, min(start + _TOGETHER, len(tile)))
+        there = painted[some, 3] > 0
+        place = (tile[some][there] + 1, *within[some][there].T)
+        rgb, weight = np.split(painted[some][there], [3], axis=-1)
+        tiles[(*place, slice(0, 3))] = np.round(255 * rgb / weight)
+        tiles[(*place, 3)] = 255
     slot = np.zeros(capacity, np.int32)
     slot[rows] = np.arange(1, len(rows) + 1)
     return Texture(slot, tiles)
@@ -89,18 +94,19 @@ def textured(scene: SceneField, config: BlockConfig) -> SceneField:
     return SceneField(scene.init, query)
 
 
-def _make_add(camera: Camera, near: float):
-    """The compiled step that adds what a keyframe shows to the colours (m, s, 4) of chunks of points."""
+def _make_add(camera: Camera, side: float, near: float):
+    """The compiled step that adds what a keyframe shows to the colours (m, s, 4) of chunks of nodes."""
     in_view = in_view_test(camera)
 
     @partial(jax.jit, donate_argnums=0)
-    def add(total, points, corners, image, T_world_cam):
+    def add(total, index, corners, image, T_world_cam):
         T_cam_world, seen_at = se3.inverse(T_world_cam), seen_by(image, camera)
-        in_sight = in_view(se3.apply(T_cam_world, corners), jnp.max(image.depth) + near)
+        place = lambda index: side * index.astype(jnp.float32)
+        in_sight = in_view(se3.apply(T_cam_world, place(corners)), jnp.max(image.depth) + near)
         order = jnp.argsort(~in_sight)
 
         def add_chunk(n, total):
-            points_cam = se3.apply(T_cam_world, points[order[n]])
+            points_cam = se3.apply(T_cam_world, place(index[order[n]]))
             at = locate(camera, points_cam)
             seen = seen_at(at)
             same = (seen.weight > 0) & (jnp.abs(seen.distance(points_cam)) < near)
@@ -116,21 +122,24 @@ def _make_add(camera: Camera, near: float):
 
 def _near_surface(
     config: BlockConfig, values: Int[np.ndarray, "c 9 9 9 8"]
-) -> tuple[Int[np.ndarray, " n"], np.ndarray]:
-    """The rows of blocks with texture nodes near the surface, and which of their nodes these are."""
+) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " m"], UInt8[np.ndarray, "m 3"]]:
+    """The rows of blocks with texture nodes near the surface, and these nodes: whose, and where in it."""
     thick = _THICKNESS * config.voxel / _FINER
-    rows, near = [], []
+    rows, tiles, within, count = [], [], [], 0
     for part in np.array_split(np.arange(len(values)), max(len(values) // 256, 1)):
         fine = decoded(config, values[part])[..., 0]
         part = part[close := np.abs(fine).min(axis=(1, 2, 3)) < config.voxel]
         fine = fine[close]
         for axis in (1, 2, 3):
             fine = _refined(fine, axis)
-        mask = np.abs(fine) < thick
-        kept = mask.any(axis=(1, 2, 3))
+        near = np.abs(fine) < thick
+        kept = near.any(axis=(1, 2, 3))
+        tile, *place = np.nonzero(near[kept])
         rows.append(part[kept])
-        near.append(mask[kept])
-    return np.concatenate(rows), np.concatenate(near)
+        tiles.append((count + tile).astype(np.int32))
+        within.append(np.stack(place, axis=-1).astype(np.uint8))
+        count += len(rows[-1])
+    return tuple(np.concatenate(x) for x in (rows, tiles, within))
 
 
 def _refined(values: np.ndarray, axis: int) -> np.ndarray:
