@@ -19,7 +19,7 @@ from jaxpose.slam.config import LoopConfig
 from jaxpose.slam.keyframes import seen_shares
 from jaxpose.slam.loops.closure import corrected, followed, is_same_place, poses_by_motions
 from jaxpose.slam.loops.drift import drift_to_last, may_be_doubled
-from jaxpose.slam.loops.rebuild import rebuilt
+from jaxpose.slam.loops.rebuild import rebuilt, resumed
 from jaxpose.slam.loops.refine import refined
 from jaxpose.slam.loops.types import no_loops
 from jaxpose.slam.loops.verify import Comparison, Verified, verify
@@ -192,7 +192,10 @@ def test_loops_straighten_a_bent_run_and_its_map(again, tmp_path):
         return trajectory_error.ate(T, recording.T_world_cam).rmse, np.median(np.abs(distance))
 
     ate_bent, _ = off(state)
-    fixed = corrected(state._replace(loops=loops), None, recording.read)
+    begun = corrected(state._replace(loops=loops), None, recording.read)
+    assert len(begun.pending) == len(keyframes) - 12  # made anew while the run goes on
+    fixed = resumed(begun, recording.read)
+    assert not len(fixed.pending)
     ate, wall = off(fixed)
     assert ate_bent > 0.05 and ate < 0.02 and ate < ate_bent / 4
     assert wall < 0.01

@@ -46,7 +46,7 @@ def load(path: Path | str, recording: Recording, config: SlamConfig) -> SlamStat
         readings = len(file["['state'].imu.t"]) if "['state'].imu.t" in file else None
         blocks = len(file["['state'].map.params[0]"])
         loops = len(file["['state'].loops.a"])
-        coarser = len(file["['state'].coarser_at"])
+        coarser, pending = (len(file[f"['state'].{name}"]) for name in ("coarser_at", "pending"))
         size: dict[str, Any] = {k: tuple(x) if isinstance(x, list) else x for k, x in size.items()}
         grid = kind(**size)
     state = begin(recording, config)._replace(
@@ -56,6 +56,7 @@ def load(path: Path | str, recording: Recording, config: SlamConfig) -> SlamStat
         imu=None if readings is None else Imu(*(np.zeros((readings, *shape)) for shape in ((), (3,), (3,)))),
         loops=no_loops(loops),
         coarser_at=np.zeros(coarser, int),
+        pending=np.zeros(pending, int),
         grid=grid,
     )
     state = state._replace(map=map_backend(state).start())
@@ -92,7 +93,8 @@ def _check(path: Path | str, state: SlamState) -> None:
     for name in ("twist", "velocity_body", "gyro_bias", "accelerometer_bias_world"):
         numbers(path, motion._asdict(), name, (None,), least=-_FASTEST, most=_FASTEST)
     numbers(path, state._asdict(), "max_depth", above=0, most=_FASTEST)
-    numbers(path, state._asdict(), "coarser_at", (None,), whole=True, least=0, most=frames.count - 1)
+    for name in ("coarser_at", "pending"):
+        numbers(path, state._asdict(), name, (None,), whole=True, least=0, most=frames.count - 1)
     numbers(path, state._asdict(), "settled", whole=True, least=0, most=frames.count - 1)
     for leaf in jax.tree.leaves((state.params, state.exposure, state.thumbnails, state.map)):
         if jnp.issubdtype(leaf.dtype, jnp.floating) and not np.isfinite(leaf).all():

@@ -27,7 +27,7 @@ from jaxpose.slam.config import SlamConfig
 from jaxpose.slam.initial_pose import first_pose, upright_pose
 from jaxpose.slam.keyframes import FrameReader, coarse_depth, keyframe_images, thumbnail
 from jaxpose.slam.loops.closure import with_loops
-from jaxpose.slam.loops.rebuild import with_room
+from jaxpose.slam.loops.rebuild import EACH, resumed, with_room
 from jaxpose.slam.loops.refine import refined
 from jaxpose.slam.loops.types import Loops, no_loops
 from jaxpose.slam.map.backend import as_blocks, framed_field, is_mapped, map_frame, seen_points
@@ -126,6 +126,7 @@ def init(
         keyframe_features=(),
         loops=no_loops(),
         settled=0,
+        pending=np.zeros(0, int),
         coarser_at=np.zeros(0, int),
         images=(),
         readings=(),
@@ -189,7 +190,10 @@ def finish(state: SlamState) -> SlamResult:
     Raises:
         DataError: for fewer than two frames.
     """
-    return _finish(state, lambda i: _kept_image(state, i), all_readings(state.readings))
+    read = lambda i: _kept_image(state, i)
+    copied = lambda: state._replace(map=jax.tree.map(jnp.copy, state.map))
+    whole = resumed(copied(), read) if len(state.pending) else state
+    return _finish(whole, read, all_readings(state.readings))
 
 
 def run(
@@ -244,7 +248,7 @@ def track_all(
         state = state._replace(frames=state.frames.put(i, seconds=time.perf_counter() - started))
         if on_frame is not None:
             on_frame(Progress(i, len(recording.t), state, _ground_truth_error(recording, state)))
-    return state
+    return resumed(state, recording.read)
 
 
 def begin(recording: Recording, config: SlamConfig = _DEFAULT) -> SlamState:
@@ -275,6 +279,7 @@ def begin(recording: Recording, config: SlamConfig = _DEFAULT) -> SlamState:
 
 def _advance(state: SlamState, frame: Frame, t: float, imu: Imu | None, read: FrameReader) -> SlamState:
     """The run after one more frame. The map of `state` is written over."""
+    state = resumed(state, read, EACH)
     i, config = state.frames.count, state.config
     generator = np.random.default_rng([config.seed, i])
     track_key, map_key = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), i))
@@ -345,8 +350,7 @@ def _refit(camera: Camera, config: SlamConfig):
 
 def _finish(state: SlamState, read: FrameReader, imu: Imu | None) -> SlamResult:
     """One continuous trajectory, by all readings or else through all poses, and the map with its texture."""
-    count = state.frames.count
-    if count < 2:
+    if (count := state.frames.count) < 2:
         raise DataError(f"SLAM: expected at least 2 frames, got {count}")
     if state.config.frame == "intrinsic" and not is_due(count - 1):
         state = _update_intrinsic_frame(state)

@@ -172,6 +172,7 @@ class SlamState(NamedTuple):
     keyframe_features: tuple[Features, ...]
     loops: Loops
     settled: int  # frame at which poses and loops last agreed, by a correction or without; 0: never
+    pending: Int[np.ndarray, " p"]  # frames that a map made anew lacks yet, the most needed first
     coarser_at: Int[np.ndarray, " c"]  # frames at which voxels became twice as wide, for want of room
     images: tuple[Frame, ...]  # of the keyframes, where no recording can give them again
     readings: tuple[Imu, ...]  # all of them, as they came, where no recording can give them again

@@ -14,7 +14,7 @@ from jaxpose.datasets.types import Frame
 from jaxpose.estimate.pose_graph import CHI2_999, Edges, optimise_pose_graph
 from jaxpose.geometry import rigid
 from jaxpose.slam.config import LoopConfig
-from jaxpose.slam.keyframes import FrameReader, seen_shares, unlikeness
+from jaxpose.slam.keyframes import FrameReader, overlap, seen_shares, unlikeness
 from jaxpose.slam.loops.drift import drift_to_last, may_be_doubled, motion_sigmas
 from jaxpose.slam.loops.rebuild import rebuilt
 from jaxpose.slam.loops.verify import Verified, verify
@@ -25,6 +25,7 @@ from jaxpose.slam.types import Frames, SlamState
 
 _LEAST_SIGMA = 1e-5  # [m, rad] of a motion
 _SAME = 1e-6  # [m, rad] by which a motion may differ from the poses that it leads to
+_AT_ONCE = 12  # keyframes that a corrected map is made of before the next frame
 _JUMP = 3.0  # sigmas of the motions' drift from which poses have jumped
 
 
@@ -192,7 +193,8 @@ def corrected(state: SlamState, frame: Frame | None, read: FrameReader) -> SlamS
         read: keyframes.
 
     Returns:
-        The state, whose loops are marked that the others speak against.
+        The state, whose loops are marked that the others speak against. Of the map it has what the last frame
+        shows; the rest follows beside the frames that come (`rebuild.resumed`).
     """
     frames, keyframes = state.frames, np.flatnonzero(state.frames.keyframe)
     T_world_cam = frames.T_world_body[keyframes] @ state.T_body_cam
@@ -206,7 +208,10 @@ def corrected(state: SlamState, frame: Frame | None, read: FrameReader) -> SlamS
     last, loops = frames.count - 1, state.loops._replace(believed=believed)
     state = state._replace(frames=after, motion=motion, loops=loops, settled=last)
     now = read if frame is None else lambda i: frame if i == last else read(i)
-    return rebuilt(state, keyframes, now)
+    poses = after.T_world_body[keyframes] @ state.T_body_cam
+    shares = overlap(seen_points(now(last), state.camera, poses[-1]), poses, state.camera, state.max_depth)
+    away = np.linalg.norm(poses[:, :3, 3] - poses[-1, :3, 3], axis=1)
+    return rebuilt(state, keyframes[np.lexsort((away, -shares))], now, _AT_ONCE)
 
 
 def _edges(state: SlamState, keyframes: Int[np.ndarray, " k"]) -> Edges:

@@ -21,6 +21,7 @@ from jaxpose.slam.rolling_shutter import at_first_row
 from jaxpose.slam.types import SlamState
 
 _TOGETHER = 16  # frames that room is made for at once
+EACH = 3  # frames integrated anew beside each that comes
 
 
 class Posed(NamedTuple):
@@ -31,27 +32,50 @@ class Posed(NamedTuple):
     T_world_cam: Float[np.ndarray, "4 4"]
 
 
-def rebuilt(state: SlamState, chosen: Int[np.ndarray, " k"], read: FrameReader) -> SlamState:
+def rebuilt(
+    state: SlamState, chosen: Int[np.ndarray, " k"], read: FrameReader, at_once: int | None = None
+) -> SlamState:
     """The run with the map that integrating some of its frames makes, written over the old one.
 
     Args:
         state: a run that maps by integration. Its map is no longer usable.
-        chosen: (k,) which frames.
+        chosen: (k,) which frames, the most needed ones first.
         read: gives them; a few are held at a time.
+        at_once: how many to integrate now; the rest is `pending`. None: all.
 
     Returns:
         The state; nothing is compiled for it, unless it needs more room than before. Where there is none, its
         voxels are twice as wide.
     """
+    assert state.map is not None
+    empty = MapState(_emptied(state.map.params), ())
+    return resumed(state._replace(map=empty, pending=chosen), read, at_once)
+
+
+def resumed(state: SlamState, read: FrameReader, count: int | None = None) -> SlamState:
+    """The run with more of the frames integrated that its map still lacks since it was begun anew.
+
+    Args:
+        state: a run. Its map is no longer usable, if it lacks any.
+        read: gives frames.
+        count: how many at most; None: all.
+
+    Returns:
+        The state.
+    """
+    if not len(state.pending):
+        return state
+    count = len(state.pending) if count is None else count
+    left, state = state.pending[:count].tolist(), state._replace(pending=state.pending[count:])
     assert isinstance(state.grid, BlockConfig) and state.map is not None
-    made, update, left = MapState(_emptied(state.map.params), ()), map_backend(state).update, chosen.tolist()
+    made, update = state.map, map_backend(state).update
     while left:
         some, left = [posed(state, read(i), i) for i in left[:_TOGETHER]], left[_TOGETHER:]
         measured = [allocation_points(x.frame, state.camera, x.T_world_cam) for x in some]
         try:
             made = grown_map(state.grid, made, np.concatenate(measured), state.config.map_budget)
         except PoolFull:
-            return rebuilt(_coarser(state._replace(map=made)), chosen, read)
+            return rebuilt(_coarser(state._replace(map=made)), np.flatnonzero(state.frames.keyframe), read)
         for x in some:
             image = to_device(x.frame)._replace(exposure=jnp.asarray(x.exposure, jnp.float32))
             made = update(made, image, jnp.asarray(x.T_world_cam, jnp.float32))

@@ -139,7 +139,7 @@ def _near_surface(
         tiles.append((count + tile).astype(np.int32))
         within.append(np.stack(place, axis=-1).astype(np.uint8))
         count += len(rows[-1])
-    return tuple(np.concatenate(x) for x in (rows, tiles, within))
+    return np.concatenate(rows), np.concatenate(tiles), np.concatenate(within)
 
 
 def _refined(values: np.ndarray, axis: int) -> np.ndarray:
