@@ -26,7 +26,7 @@ from jaxpose.slam.map.texture import SIDE, Texture
 _VERSION = 3
 _TOGETHER = 256  # blocks
 _LARGEST_M = 1e4  # of voxels and distances
-_FARTHEST_BLOCK = 511  # from the origin: a table of 1024^3
+_FARTHEST_BLOCK = 1023  # from the origin: a table of 256^3 bricks
 
 
 class SavedMap(NamedTuple):
@@ -42,8 +42,8 @@ def write_map(path: Path | str, saved: SavedMap) -> None:
     """Write a map (npz, compressed): version, resolution, blocks in use, texture, keyframes.
 
     `coords` (n, 3) say which block of space each is, 8 voxels wide and beginning at a multiple of that;
-    `values` (n, 9, 9, 9, 4) are signed distance [m] and colour at its nodes, `texture_tiles` (m, 17, 17, 17,
-    4) finer colour and 255 where there is any, tile `texture_slot[k]` for block k.
+    `values` (n, 9, 9, 9, 4), float16, are signed distance [m] and colour of nodes, `texture_tiles` (m, 17,
+    17, 17, 4) finer colour and 255 where there is any, tile `texture_slot[k]` for block k.
     """
     coords, stored = packed(saved.blocks)
     arrays = asdict(saved.config) | {
@@ -62,8 +62,8 @@ def write_map(path: Path | str, saved: SavedMap) -> None:
 def _distance_and_colour(
     config: BlockConfig, stored: Int[np.ndarray, "n 9 9 9 8"]
 ) -> Float[np.ndarray, "n 9 9 9 4"]:
-    """The first channels of the nodes, a few blocks at a time: all of them would be twice as many bytes."""
-    values = np.empty((*stored.shape[:-1], 4), np.float32)
+    """The first channels of the nodes, float16, made of a few blocks at a time: memory is the file's."""
+    values = np.empty((*stored.shape[:-1], 4), np.float16)
     for start in range(0, len(stored), _TOGETHER):
         values[start : start + _TOGETHER] = decoded(config, stored[start : start + _TOGETHER])[..., :4]
     return values

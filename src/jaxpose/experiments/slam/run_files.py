@@ -27,6 +27,7 @@ from jaxpose.fields import save
 from jaxpose.files import atomic, trajectories
 from jaxpose.files.camera_json import write_camera
 from jaxpose.files.ply import write_ply
+from jaxpose.files.run_folder import give_back_memory
 from jaxpose.geometry.rigid import Similarity
 from jaxpose.plots import slam as slam_plots
 from jaxpose.slam import SlamResult
@@ -52,6 +53,7 @@ def write_run(
         truth.
     """
     recording, ground_truth = source.recording, source.recording.T_world_cam
+    give_back_memory()
     on_update(Update("measuring the trajectory"))
     errors = None if ground_truth is None else accuracy(result, recording.t, ground_truth)
     measured = Measured(errors, inertial(recording, result), freedom(recording, result))

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int, UInt8
 
+from jaxpose.files.run_folder import give_back_memory
 from jaxpose.geometry import se3
 from jaxpose.geometry.camera import Camera
 from jaxpose.scenes import SceneField
@@ -48,6 +49,7 @@ def make_texture(
     A node's colour is the mean over the keyframes that measured the surface there, weighted by how many
     pixels a piece of it fills.
     """
+    give_back_memory()  # what the final trajectory has freed
     count, capacity = int(blocks.count), blocks.coords.shape[0]
     rows, tile, within = _near_surface(config, np.asarray(blocks.values)[:count])
     if not len(rows):
@@ -55,8 +57,9 @@ def make_texture(
     # The nodes near the surface of all tiles in turn, those of a few tiles next to each other in one chunk.
     size = max(len(tile) * _NEIGHBOURS // len(rows), 1)
     index = np.empty((-(-len(tile) // size), size, 3), np.int32)
-    flat = index.reshape(-1, 3)
-    np.add(_FINER * CELLS * np.asarray(blocks.coords)[rows][tile], within, out=flat[: len(tile)])
+    flat, first = index.reshape(-1, 3), _FINER * CELLS * np.asarray(blocks.coords)[rows]
+    for some in _slices(len(tile)):
+        flat[some] = first[tile[some]] + within[some]
     flat[len(tile) :] = flat[len(tile) - 1]
     ends = np.stack([index.min(axis=1), index.max(axis=1)])
     corners = np.stack([ends[list(k), :, [0, 1, 2]].T for k in np.ndindex(2, 2, 2)], axis=1)
@@ -65,10 +68,10 @@ def make_texture(
     del index, flat
     for keyframe in keyframes:
         total = add(total, *nodes, keyframe.image, jnp.asarray(keyframe.T_world_cam, jnp.float32))
+    del nodes
     tiles = np.zeros((len(rows) + 1, SIDE, SIDE, SIDE, 4), np.uint8)
     painted = np.asarray(total).reshape(-1, 4)
-    for start in range(0, len(tile), _TOGETHER):
-        some = slice(start, min(start + _TOGETHER, len(tile)))
+    for some in _slices(len(tile)):
         there = painted[some, 3] > 0
         place = (tile[some][there] + 1, *within[some][there].T)
         rgb, weight = np.split(painted[some][there], [3], axis=-1)
@@ -77,6 +80,11 @@ def make_texture(
     slot = np.zeros(capacity, np.int32)
     slot[rows] = np.arange(1, len(rows) + 1)
     return Texture(slot, tiles)
+
+
+def _slices(count: int) -> list[slice]:
+    """Nodes in turn, a few at a time."""
+    return [slice(k, min(k + _TOGETHER, count)) for k in range(0, count, _TOGETHER)]
 
 
 def textured(scene: SceneField, config: BlockConfig) -> SceneField:
