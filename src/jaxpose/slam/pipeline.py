@@ -396,6 +396,5 @@ def _rigid(name: str, T: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
 def _ground_truth_error(recording: Recording, state: SlamState) -> float:
     if recording.T_world_cam is None:
         return float("nan")
-    i = state.frames.count - 1
-    estimate = state.frames.T_world_body[i] @ recording.T_body_cam
+    estimate, i = state.frames.T_world_body[-1] @ recording.T_body_cam, state.frames.count - 1
     return float(np.linalg.norm(recording.T_world_cam[i, :3, 3] - estimate[:3, 3]))

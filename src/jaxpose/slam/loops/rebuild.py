@@ -21,7 +21,7 @@ from jaxpose.slam.rolling_shutter import at_first_row
 from jaxpose.slam.types import SlamState
 
 _TOGETHER = 16  # frames that room is made for at once
-EACH = 3  # frames integrated anew beside each that comes
+EACH = 2  # frames integrated anew beside each that comes
 
 
 class Posed(NamedTuple):
