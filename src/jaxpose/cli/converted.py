@@ -1,7 +1,7 @@
 """A recording written as a folder of image files: plain, TUM's or EuRoC's."""
 
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,6 +21,7 @@ from jaxpose.files.tables import format_rows
 from jaxpose.files.timestamps import format_ns, whole_ns
 from jaxpose.files.trajectories import Trajectory, write_euroc, write_tum
 from jaxpose.geometry import rigid
+from jaxpose.geometry.camera import pinhole_matrix
 from jaxpose.imu import ADIS16448, GRAVITY_WORLD
 
 _MOST = 65534  # counts of depth; 65535 means none
@@ -135,24 +136,25 @@ def _plan(recording: Recording, source: Path, to: str, notes: list[str]) -> _Cop
 
 
 def _images(
-    copy: _Copy,
-    on_update: OnUpdate,
-    color: Callable[[int, str], Path],
-    depth: Callable[[int], Path],
-) -> None:
-    """Write or copy the images of all frames; `color` takes a frame and the suffix of its file."""
+    copy: _Copy, on_update: OnUpdate, stems: list[str], color: Path, depth: Path
+) -> tuple[list[str], list[str]]:
+    """Write or copy the images of all frames into two folders; the names of their files."""
+    color.mkdir(parents=True)
+    depth.mkdir(parents=True)
+    suffixes = [file.suffix for file in copy.colors] or [".png"] * len(stems)
+    names = [stem + suffix for stem, suffix in zip(stems, suffixes, strict=True)]
+    depth_names = [f"{stem}.png" for stem in stems]
     lost = rounded = 0.0
-    for i in range(len(copy.ns)):
-        on_update(Update(f"writing frame {i + 1} of {len(copy.ns)}"))
-        places = [(copy.colors, color), (copy.depths, lambda i, suffix: depth(i))]
-        for files, place in places:
+    for i, (name, depth_name) in enumerate(zip(names, depth_names, strict=True)):
+        on_update(Update(f"writing frame {i + 1} of {len(stems)}"))
+        for files, place in ((copy.colors, color / name), (copy.depths, depth / depth_name)):
             if files:
-                shutil.copyfile(files[i], place(i, files[i].suffix))
+                shutil.copyfile(files[i], place)
         if copy.colors and copy.depths:
             continue
         frame = copy.recording.read(i)
         if not copy.colors:
-            Image.fromarray(frame.rgb).save(color(i, ".png"), compress_level=1)
+            Image.fromarray(frame.rgb).save(color / name, compress_level=1)
         if not copy.depths:
             exact = frame.depth.astype(np.float64) * copy.per_metre
             counts = np.rint(exact)
@@ -160,24 +162,24 @@ def _images(
             lost += int(beyond.sum())
             rounded = max(rounded, float(np.abs(counts - exact)[~beyond].max(initial=0)))
             pixels = np.where(beyond, 0, counts).astype(np.uint16)
-            Image.fromarray(pixels).save(depth(i), compress_level=1)
+            Image.fromarray(pixels).save(depth / depth_name, compress_level=1)
     if lost:
         copy.notes.append(
             f"{lost:.0f} pixels beyond {_MOST / copy.per_metre:.4g} m have no depth in the copy"
         )
     if rounded > 0.01:
         copy.notes.append(f"depth is rounded to {1000 / copy.per_metre:g} mm")
+    return names, depth_names
+
+
+def _list(file: Path, head: str, lines: Iterable[tuple[str, str]], mark: str) -> None:
+    """A list of timestamps and files."""
+    write_text(file, f"#{head}\n" + "".join(f"{stamp}{mark}{name}\n" for stamp, name in lines))
 
 
 def _plain(folder: Path, copy: _Copy, on_update: OnUpdate) -> None:
-    for name in ("color", "depth"):
-        (folder / name).mkdir()
-    _images(
-        copy,
-        on_update,
-        lambda i, suffix: folder / f"color/{i:06d}{suffix}",
-        lambda i: folder / f"depth/{i:06d}.png",
-    )
+    stems = [f"{i:06d}" for i in range(len(copy.ns))]
+    _images(copy, on_update, stems, folder / "color", folder / "depth")
     camera, recording = copy.recording.camera, copy.recording
     content: dict[str, Any] = {
         key: getattr(camera, key) for key in ("fx", "fy", "cx", "cy", "width", "height")
@@ -194,21 +196,12 @@ def _plain(folder: Path, copy: _Copy, on_update: OnUpdate) -> None:
 
 def _tum(folder: Path, copy: _Copy, on_update: OnUpdate) -> None:
     camera, recording = copy.recording.camera, copy.recording
-    names = [format_ns(ns) for ns in copy.ns]
-    for kind in ("rgb", "depth"):
-        (folder / kind).mkdir()
-    _images(
-        copy,
-        on_update,
-        lambda i, suffix: folder / f"rgb/{names[i]}{suffix}",
-        lambda i: folder / f"depth/{names[i]}.png",
-    )
-    for kind, files in (("rgb", copy.colors), ("depth", [])):
-        ends = [file.suffix for file in files] or [".png"] * len(names)
-        lines = [f"{name} {kind}/{name}{end}\n" for name, end in zip(names, ends, strict=True)]
-        write_text(folder / f"{kind}.txt", "# timestamp filename\n" + "".join(lines))
-    K = [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]
-    write_text(folder / INTRINSICS, format_rows(np.array(K)))
+    stamps = [format_ns(ns) for ns in copy.ns]
+    names = _images(copy, on_update, stamps, folder / "rgb", folder / "depth")
+    for kind, files in zip(("rgb", "depth"), names, strict=True):
+        lines = ((stamp, f"{kind}/{file}") for stamp, file in zip(stamps, files, strict=True))
+        _list(folder / f"{kind}.txt", " timestamp filename", lines, " ")
+    write_text(folder / INTRINSICS, format_rows(pinhole_matrix(*camera[:4])))
     if (known := _known(recording)) is not None:
         write_tum(folder / "groundtruth.txt", known)
     _imu(folder / "imu.csv", folder / "sensor.yaml", recording)
@@ -216,18 +209,10 @@ def _tum(folder: Path, copy: _Copy, on_update: OnUpdate) -> None:
 
 def _euroc(folder: Path, copy: _Copy, on_update: OnUpdate) -> None:
     recording, mav0 = copy.recording, folder / "mav0"
-    for name in ("cam0", "depth0"):
-        (mav0 / name / "data").mkdir(parents=True)
-    _images(
-        copy,
-        on_update,
-        lambda i, suffix: mav0 / f"cam0/data/{copy.ns[i]}{suffix}",
-        lambda i: mav0 / f"depth0/data/{copy.ns[i]}.png",
-    )
-    for name, files in (("cam0", copy.colors), ("depth0", [])):
-        ends = [file.suffix for file in files] or [".png"] * len(copy.ns)
-        lines = [f"{ns},{ns}{end}\n" for ns, end in zip(copy.ns, ends, strict=True)]
-        write_text(mav0 / name / "data.csv", "#timestamp [ns],filename\n" + "".join(lines))
+    stamps = [str(ns) for ns in copy.ns]
+    names = _images(copy, on_update, stamps, mav0 / "cam0/data", mav0 / "depth0/data")
+    for name, files in zip(("cam0", "depth0"), names, strict=True):
+        _list(mav0 / name / "data.csv", "timestamp [ns],filename", zip(stamps, files, strict=True), ",")
     camera = recording.camera
     lens = (*camera.distortion, *[0.0] * 4)[: max(4, len(camera.distortion))]
     sheet = [

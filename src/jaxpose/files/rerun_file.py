@@ -11,7 +11,7 @@ from jaxpose.errors import DataError
 from jaxpose.files.atomic import atomic
 from jaxpose.files.timestamps import FLOAT_S, whole_ns
 from jaxpose.files.trajectories import Trajectory
-from jaxpose.geometry.camera import Camera
+from jaxpose.geometry.camera import Camera, pinhole_matrix
 
 EXTRA = 'pip install -e ".[rerun]"'
 _NAME = "jaxpose"
@@ -63,7 +63,7 @@ def write_rerun(
         )
         if camera is not None:
             # rerun counts pixels from the outer corner of the first one, as its images do.
-            K = [[camera.fx, 0, camera.cx + 0.5], [0, camera.fy, camera.cy + 0.5], [0, 0, 1]]
+            K = pinhole_matrix(camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5)
             size, axes = [camera.width, camera.height], rr.ViewCoordinates.RDF
             pinhole = rr.Pinhole(image_from_camera=K, resolution=size, camera_xyz=axes)
             stream.log("world/camera", pinhole, static=True)

@@ -44,6 +44,24 @@ class Camera(NamedTuple):
     distortion: tuple[float, ...] = ()
 
 
+def pinhole_matrix(fx: float, fy: float, cx: float, cy: float) -> Float[np.ndarray, "3 3"]:
+    """The matrix that takes a point in camera axes to its pixel, times its depth.
+
+    Args:
+        fx: As `Camera` has them [px],
+        fy: likewise,
+        cx: likewise,
+        cy: likewise.
+
+    Returns:
+        K.
+
+    >>> pinhole_matrix(30.0, 31.0, 15.5, 11.5).tolist()
+    [[30.0, 0.0, 15.5], [0.0, 31.0, 11.5], [0.0, 0.0, 1.0]]
+    """
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
 def project(camera: Camera, point_cam: Float[Array, "*n 3"]) -> Float[Array, "*n 2"]:
     """The pixel (u, v) of points in camera axes; differentiable, for any leading axes.
 

@@ -15,7 +15,7 @@ from jaxpose.events import Mosaic
 from jaxpose.files.camera_json import read_camera
 from jaxpose.files.tables import read_numbers
 from jaxpose.files.trajectories import Trajectory, read_trajectory, since
-from jaxpose.geometry.camera import Camera
+from jaxpose.geometry.camera import Camera, pinhole_matrix
 
 # Width and height of event cameras: DVS128, DAVIS240, ATIS, DAVIS346, VGA (Prophesee, DSEC), 720p.
 _SENSORS = ((128, 128), (240, 180), (304, 240), (346, 260), (640, 480), (1280, 720))
@@ -113,7 +113,7 @@ def _read_calibration(file: Path) -> tuple[Float[np.ndarray, "3 3"], tuple[float
     if len(numbers) != 1:
         raise DataError(f"{file}: expected one line of {_CALIBRATION}, got {len(numbers)} lines")
     fx, fy, cx, cy, *lens = (float(number) for number in numbers[0])
-    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), tuple(lens) if any(lens) else ()
+    return pinhole_matrix(fx, fy, cx, cy), tuple(lens) if any(lens) else ()
 
 
 def _guess_size(stream: Stream, centre: tuple[float, float] | None) -> tuple[int, int]:

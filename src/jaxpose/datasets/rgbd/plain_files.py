@@ -14,7 +14,7 @@ from jaxpose.files.tables import numbered_lines, read_numbers, seconds
 from jaxpose.files.timestamps import whole_ns
 from jaxpose.files.trajectories import read_kitti, read_trajectory
 from jaxpose.files.untrusted import read_json
-from jaxpose.geometry.camera import Camera
+from jaxpose.geometry.camera import Camera, pinhole_matrix
 
 JSON = ("intrinsics.json", "camera_intrinsic.json", "intrinsic.json")
 LOGS = ("trajectory.log", "scene/trajectory.log")
@@ -47,7 +47,7 @@ def _read_json(file: Path, size: tuple[int, int]) -> tuple[Camera, float | None]
         K = np.reshape(numbers(file, {"K": np.ravel(content["K"]).tolist()}, "K", (9,)), (3, 3))
     else:
         fx, fy, cx, cy = (number(key) for key in ("fx", "fy", "cx", "cy"))
-        K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+        K = pinhole_matrix(fx, fy, cx, cy)
     stated = tuple(
         number(key) if key in content else of for key, of in zip(("width", "height"), size, strict=True)
     )

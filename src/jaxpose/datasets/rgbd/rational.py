@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxpose.geometry.camera import Camera, pixel_grid
+from jaxpose.geometry.camera import Camera, pinhole_matrix, pixel_grid
 
 _ITERATIONS = 30  # each leaves less than half of the error, for lenses of up to 120 degrees
 _ENOUGH = 1e-7  # [rad]
@@ -32,7 +32,7 @@ def undistortion(camera: Camera, coefficients: Float[np.ndarray, " k"], *, fishe
     """
     import cv2
 
-    K, size = _matrix(camera), (camera.width, camera.height)
+    K, size = pinhole_matrix(*camera[:4]), (camera.width, camera.height)
     module = cv2.fisheye if fisheye else cv2
     return Maps(*module.initUndistortRectifyMap(K, coefficients, np.eye(3), K, size, cv2.CV_32FC1))
 
@@ -75,14 +75,10 @@ def pixel_rays(
         for _ in range(_ITERATIONS):  # OpenCV's undistortPoints stops after 5 in some of its versions
             rays[:, :2] += off
             module = cv2.fisheye if fisheye else cv2
-            at = rays[:, None], np.zeros(3), np.zeros(3), _matrix(camera), coefficients
+            at = rays[:, None], np.zeros(3), np.zeros(3), pinhole_matrix(*camera[:4]), coefficients
             again = module.projectPoints(*at)[0]
             off = (pixels - again[:, 0]) / focal
             if not (np.abs(off) > _ENOUGH).any():
                 break
         rays[~(np.abs(off * focal).max(axis=1) < _OFF_PX)] = np.nan
     return rays.reshape(camera.height, camera.width, 3)
-
-
-def _matrix(camera: Camera) -> Float[np.ndarray, "3 3"]:
-    return np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])

@@ -21,6 +21,7 @@ from jaxpose.errors import DataError
 from jaxpose.files.schema import numbers
 from jaxpose.files.tables import read_numbers
 from jaxpose.files.untrusted import read_json
+from jaxpose.geometry.camera import pinhole_matrix
 
 _IMAGE = re.compile(r"(frame|depth)(\d+)\.(jpg|jpeg|png)", re.IGNORECASE)
 _LAYOUT = "results/frameNNNNNN.jpg with results/depthNNNNNN.png"
@@ -106,7 +107,7 @@ def _read_parameters(folder: Path, size: tuple[int, int]) -> _Parameters:
         raise DataError(
             f"{file}: expected the size of the images, {size[0]}x{size[1]}, got {width:g}x{height:g}"
         )
-    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    K = pinhole_matrix(fx, fy, cx, cy)
     return _Parameters(check_intrinsics(file, K, size), per_metre, ())
 
 

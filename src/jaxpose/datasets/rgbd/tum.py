@@ -25,7 +25,7 @@ from jaxpose.files.association import nearest
 from jaxpose.files.tables import numbered_lines, read_all_numbers, read_numbers, read_stamped_names
 from jaxpose.files.trajectories import read_trajectory, since
 from jaxpose.geometry import rigid
-from jaxpose.geometry.camera import Camera
+from jaxpose.geometry.camera import Camera, pinhole_matrix
 from jaxpose.imu import GRAVITY_WORLD
 from jaxpose.imu.gravity import gravity_note
 
@@ -179,7 +179,7 @@ def _camera(folder: Path, size: tuple[int, int]) -> tuple[Camera, tuple[str, ...
         return Camera(*read_intrinsics(file, size), *size), ()
     if (file := folder / "calibration.txt").is_file():
         fx, fy, cx, cy = read_all_numbers(file, (4,), "fx fy cx cy")
-        K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+        K = pinhole_matrix(fx, fy, cx, cy)
         return Camera(*check_intrinsics(file, K, size), *size), ()
     if _is_bonn(folder):
         note = () if size == _SIZE else (default_intrinsics(_BONN[0], size, _SIZE, INTRINSICS),)
