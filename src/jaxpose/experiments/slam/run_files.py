@@ -53,12 +53,16 @@ def write_run(
         truth.
     """
     recording, ground_truth = source.recording, source.recording.T_world_cam
-    give_back_memory()
-    on_update(Update("measuring the trajectory"))
+
+    def phase(name: str) -> None:
+        give_back_memory()
+        on_update(Update(name))
+
+    phase("measuring the trajectory")
     errors = None if ground_truth is None else accuracy(result, recording.t, ground_truth)
     measured = Measured(errors, inertial(recording, result), freedom(recording, result))
     _write_trajectory(folder, source, result)
-    on_update(Update("writing the map"))
+    phase("writing the map")
     write_map(folder / "map.npz", SavedMap(result.map_config, *result.scene_params, result.keyframes))
     images_folder = "." if options.data is None else options.data.resolve()
     write_camera(
@@ -70,13 +74,13 @@ def write_run(
         depth_per_metre=recording.depth_per_metre,
     )
     atomic.write_json(folder / "config.json", options)
-    on_update(Update("writing the point cloud and the mesh"))
+    phase("writing the point cloud and the mesh")
     notes = (*recording.notes, *first_pose(recording).notes, *_coarser_notes(options, result))
     notes = (*notes, *_write_surface(folder, recording, result))
-    on_update(Update("rendering the map"))
+    phase("rendering the map")
     render = renderer(recording, result)
     quality = map_quality(result, render)
-    on_update(Update("drawing figures"))
+    phase("drawing figures")
     _draw(folder, f"{recording.name}, IMU {options.slam.imu}", recording, result, render, measured)
     calibration = {} if result.posterior is None else {"calibration": calibration_numbers(result.posterior)}
     found = {**tracking_numbers(result), **measured.numbers(), **calibration, "map": quality, "notes": notes}
