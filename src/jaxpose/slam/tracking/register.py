@@ -238,8 +238,11 @@ def _errors(
     Of estimating equations whose errors go together in unknown ways within parts of the image, and not beyond
     (Liang and Zeger 1986): what each part's residuals pull by is squared.
     """
-    rows = jnp.concatenate([part, jnp.repeat(part, 3)])
-    pulls = jax.ops.segment_sum((weight * residual)[:, None] * slope, rows, _PARTS**2)
+    count = part.shape[0]
+    rows = (weight * residual)[:, None] * slope
+    of_pixels = rows[:count] + rows[count:].reshape(count, 3, 6).sum(axis=1)
+    in_part = jax.nn.one_hot(part, _PARTS**2, axis=0)
+    pulls = jnp.matmul(in_part, of_pixels, precision="highest")
     seen = jnp.sum(jnp.any(pulls != 0, axis=1))
     free = seen / jnp.maximum(seen - 6, 1)  # six of the parts' sums are made nothing by the pose
     # Beyond one sigma a residual pulls by its sign alone: it does not hold the pose.
