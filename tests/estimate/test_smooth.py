@@ -151,6 +151,8 @@ BAD = {
     "estimate: expected any of biases, gravity, offset, extrinsics, scale, got wind": {"estimate": ("wind",)},
     "times: expected increasing": {"times": np.zeros(36)},
     "offset_s: expected a number of seconds, got nan": {"offset_s": np.nan},
+    "drift_s: expected seconds above 0, got 0": {"drift_s": 0.0},
+    "drift: expected shape (36, 6, 6), got (6, 6)": {"drift": np.eye(6)},
 }
 
 

@@ -59,7 +59,7 @@ def test_every_derivative_is_that_of_finite_differences(control):
         problem = Problem(
             jnp.asarray(0.2), jnp.asarray(reduced.root), jnp.asarray(reduced.value), jnp.ones(2),
             jnp.asarray(poses), jnp.asarray(measured), jnp.asarray(roots),
-            *jnp.asarray(7 * np.tril(rng.normal(size=(2, 2, 6, 6)))), state, prior,
+            *jnp.asarray(7 * np.tril(rng.normal(size=(2, 2, 6, 6)))), jnp.asarray(0.8), state, prior,
         )  # fmt: skip
         at = jax.jit(residuals)
         found = at(problem, state, noise)

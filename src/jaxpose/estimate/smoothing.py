@@ -49,7 +49,8 @@ def smooth(
     gravity_world: Float[np.ndarray, "3"] | None = None,
     offset_s: float = 0.0,
     knots_hz: float | None = None,
-    drift: Float[np.ndarray, "n 6 6"] | None = None,
+    drift: ArrayLike | None = None,
+    drift_s: float = np.inf,
 ) -> Posterior:
     """The most likely trajectory through camera poses and inertial readings, and how sure it is.
 
@@ -73,6 +74,7 @@ def smooth(
         drift: covariances (n, 6, 6) of what each pose but the first adds to an error that all later ones
             share, over its right increment: as cameras are registered to a map that earlier ones made. None:
             errors are independent.
+        drift_s: time [s] in which that shared error falls to 1/e, as what was mapped first is seen again.
 
     Returns:
         The posterior.
@@ -85,9 +87,11 @@ def smooth(
     >>> smooth(t, T, [0.01] * 3 + [0.002] * 3).covariance([1.0, 1.05]).shape
     (2, 6, 6)
     """
+    if not drift_s > 0:
+        raise ValueError(f"drift_s: expected seconds above 0, got {drift_s}")
     measured = _measured(times, T_world_cam, sigmas, drift, imu, use, estimate, noise, offset_s)
     guess = _guess(measured, T_body_cam, gravity_world, offset_s)
-    return _solved(measured, guess, fit_noise, knots_hz)
+    return _solved(measured, guess, fit_noise, knots_hz, drift_s)
 
 
 class _Measured(NamedTuple):
@@ -155,7 +159,9 @@ def _guess(measured: _Measured, T_body_cam, gravity_world, offset_s: float) -> _
     return _Guess(T_body_cam, gravity, offset_s, scale)
 
 
-def _solved(measured: _Measured, guess: _Guess, fit_noise: bool, knots_hz: float | None) -> Posterior:
+def _solved(
+    measured: _Measured, guess: _Guess, fit_noise: bool, knots_hz: float | None, drift_s: float
+) -> Posterior:
     t, imu = measured.t + guess.offset_s, measured.imu
     margin = _MARGIN_S if "offset" in measured.estimate else 0.0
     first, last = t[0] - margin, t[-1] + margin
@@ -189,6 +195,7 @@ def _solved(measured: _Measured, guess: _Guess, fit_noise: bool, knots_hz: float
             root_information=f(measured.root_information),
             root_drift=f(root_drift),
             to_camera=f(to_camera),
+            kept=f(np.exp(-3 * (last - first) / intervals / drift_s)),
             start=state,
             prior=prior,
         )

@@ -6,11 +6,11 @@ gravity, the time offset t_imu = t_pose + offset, the mounting T_body_cam and th
 spline is the body's, in metres, on the clock of the IMU. Three control poses, the bias and the drift of their
 knot are one block.
 
-Poses that are registered to a map which earlier ones made share its errors: T_measured = exp(drift) T, where
-the drift walks, each step of it small beside the camera.
+Poses that are registered to a map which earlier ones made share its errors: T_measured = exp(drift) T. The
+drift walks by steps that are small beside the camera, and is forgotten as what was mapped first is seen again.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -77,6 +77,7 @@ class Problem(NamedTuple):
     root_information: Float[Array, "p 6 6"]  # S with S^T S the inverse of the covariance
     root_drift: Float[Array, "n 6 6"]  # the same of the drift's step over each block, in the axes of a camera
     to_camera: Float[Array, "n 6 6"]  # which twists of the world are brought to by these
+    kept: Float[Array, ""]  # share of the drift that is left after a block
     start: State  # what the border's prior is about
     prior: Prior
 
@@ -112,7 +113,7 @@ def residuals(problem: Problem, state: State, noise: Noise) -> Residuals:
     pose_rows, pair = _poses(problem, state, noise, index[count * NODES :], at_poses)
     inertial, motion = _inertial(problem, state, noise, at_nodes), _motion(problem, noise, at_nodes)
     to_camera = problem.to_camera / _pose_scale(noise)[None, :, None]
-    drift = _steps(state.drift, problem.root_drift @ to_camera, DRIFT)
+    drift = _steps(state.drift, problem.root_drift @ to_camera, DRIFT, problem.kept)
     return Residuals(inertial, pose_rows, pair, motion, _walk(problem, state), drift)
 
 
@@ -168,12 +169,12 @@ def _walk(problem: Problem, state: State) -> Rows:
     return _steps(state.bias, weight, BIAS)
 
 
-def _steps(values: Float[Array, "b 6"], weight: Float[Array, "n 6 6"], part: slice) -> Rows:
-    """The steps of values of blocks, of which they are a part, times weights."""
+def _steps(values: Float[Array, "b 6"], weight: Float[Array, "n 6 6"], part: slice, kept: Any = 1.0) -> Rows:
+    """The steps of values, a part of blocks, each from a share of the last one; times weights."""
     J = jnp.zeros((*weight.shape[:2], _PAIR + BORDER), values.dtype)
-    J = J.at[:, :, part].set(-weight)
+    J = J.at[:, :, part].set(-kept * weight)
     J = J.at[:, :, BLOCK + part.start : BLOCK + part.stop].set(weight)
-    return Rows(jnp.einsum("nij,nj->ni", weight, values[1:] - values[:-1]), J)
+    return Rows(jnp.einsum("nij,nj->ni", weight, values[1:] - kept * values[:-1]), J)
 
 
 def _poses(
