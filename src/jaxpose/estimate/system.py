@@ -7,7 +7,7 @@ spline is the body's, in metres, on the clock of the IMU. Three control poses, t
 knot are one block.
 
 Poses that are registered to a map which earlier ones made share its errors: T_measured = exp(drift) T. The
-drift walks by steps that are small beside the camera, and is forgotten as what was mapped first is seen again.
+drift walks by steps that are small beside the camera, and is forgotten as what was mapped is seen again.
 """
 
 from typing import Any, NamedTuple
