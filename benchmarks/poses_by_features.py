@@ -1,6 +1,6 @@
 """Poses by features alone, from many disturbed starts: how far off they end, before anything is trained.
 
-python benchmarks/poses_by_features.py [--seeds 20] [--data DIR] [--rows "RM 60" unknown]
+python benchmarks/poses_by_features.py [--seeds 0 20] [--data DIR] [--rows "RM 60" unknown]
 
 The photographs' features do not depend on the noise: they are found once. Each row of noise is drawn by
 many seeds; its errors after the adjustment are printed seed by seed (`--each`) and as median and range. A

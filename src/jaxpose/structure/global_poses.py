@@ -7,7 +7,7 @@ then cameras and points are where rays pass the points closest (one linear probl
 import numpy as np
 import scipy.linalg
 import scipy.sparse as sp
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 
 from jaxpose.estimate.pose_graph import Edges, optimise_pose_graph
@@ -93,7 +93,7 @@ def _places(tracks: Tracks, R: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, 
     by_view, by_point = sums(view, n), sums(point, m)
     centre, usual, weight = np.zeros((n, 3)), 1.0, np.ones(len(view))
     for _ in range(_ROUNDS):
-        centre, place = _closest(by_view, by_point, view, point, weight[:, None, None] * across)
+        centre, place = _closest(by_view, by_point, point, weight[:, None, None] * across)
         away = place[point] - centre[view]
         along = np.sum(away * ray, axis=1)
         sign = -1.0 if np.median(along) < 0 else 1.0  # the problem knows no direction of a ray
@@ -107,16 +107,21 @@ def _places(tracks: Tracks, R: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, 
     return centre / usual
 
 
-def _closest(by_view, by_point, view, point, across) -> tuple[np.ndarray, np.ndarray]:
+def _closest(
+    by_view: sp.csr_matrix,
+    by_point: sp.csr_matrix,
+    point: Int[np.ndarray, " o"],
+    across: Float[np.ndarray, "o 3 3"],
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "m 3"]]:
     """Centres and points of the least sum of squares, by an eigenvector, the points eliminated."""
     n, m = by_view.shape[0], by_point.shape[0]
     total = lambda which: (which @ across.reshape(-1, 9)).reshape(-1, 3, 3)
     of_point = total(by_point)
     size = np.trace(of_point, axis1=1, axis2=2)[:, None, None]
     inverse = np.linalg.inv(of_point + (1e-9 * size + 1e-30) * np.eye(3))
-    rows = np.broadcast_to(3 * view[:, None, None] + np.arange(3)[:, None], across.shape)
-    columns = np.broadcast_to(3 * point[:, None, None] + np.arange(3), across.shape)
-    sparse = lambda blocks: sp.csr_matrix((blocks.ravel(), (rows.ravel(), columns.ravel())), (3 * n, 3 * m))
+    _, order = by_view.nonzero()  # observations, view by view
+    starts = by_view.indptr
+    sparse = lambda blocks: sp.bsr_matrix((blocks[order], point[order], starts), (3 * n, 3 * m))
     both = sparse(across)
     reduced = -(sparse(across @ inverse[point]) @ both.T).toarray()
     place = np.arange(n)

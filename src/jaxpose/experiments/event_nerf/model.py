@@ -6,11 +6,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from jaxpose import events, fields
-from jaxpose.experiments.event_nerf.options import Config, Problem
+from jaxpose.experiments.event_nerf.options import Config, Problem, on_turntable
 from jaxpose.experiments.training_loop import CHUNK
 from jaxpose.fields import PoseField, PoseNetConfig
+from jaxpose.geometry import rigid
 from jaxpose.scenes import NerfConfig, SceneField, nerf
 from jaxpose.training import events as event_training
 from jaxpose.training.events import EventData, EventTrainConfig
@@ -27,7 +29,7 @@ class Preset(NamedTuple):
     """A scene, and Adam's first and last rate and its start for the poses, by what is wrong with them."""
 
     scene: NerfConfig
-    translation: Decay
+    translation: Decay | None  # None: positions stay
     rotation: Decay
 
 
@@ -38,7 +40,9 @@ _FAST_PRESETS = {
     "positions": Preset(
         replace(_FAST_SCENE, window=(0.2, 0.7)), Decay(3e-3, 1e-4, 0.03), Decay(1e-6, 1e-7, 0.06)
     ),
-    "axis": Preset(replace(_FAST_SCENE, window=(0.1, 0.5)), Decay(1e-3, 3e-5, 0.03), Decay(3e-5, 2e-6, 0.06)),
+    # All positions are known, and the turn that all cameras share is found: what is left is slower to come
+    # than a scene that is blurred would have it.
+    "axis": Preset(replace(_FAST_SCENE, window=(0.1, 0.5)), None, Decay(1e-6, 1e-7, 0.3)),
     # A short slide is a small angle: turns of its size must come as slowly as it, after the scene.
     "all": Preset(replace(_FAST_SCENE, window=(0.1, 0.5)), Decay(3e-4, 2e-5, 0.3), Decay(1e-6, 1e-7, 0.3)),
 }
@@ -78,14 +82,15 @@ def build(config: Config, problem: Problem) -> Model:
     field, pose_rates = _field(config, problem, plan)
     scene_rate = Decay(5e-4, 5e-4) if paper else Decay(1e-3, 1e-4)
     window = {} if config.pose == "linear" or config.net.window is None else {"progress": 0.0}
-    optimizer = adam({"scene": scene_rate, "pose": pose_rates | window}, train.steps)
+    of_pose = {name: rate or 0.0 for name, rate in pose_rates.items()}
+    optimizer = adam({"scene": scene_rate, "pose": of_pose | window}, train.steps)
     trainer = event_training.trainer(
         scene, field, recording.camera, problem.depths, span, optimizer, train
     )  # fmt: skip
     return Model(
         scene,
         field,
-        {"scene": scene_rate, **pose_rates},
+        {name: rate for name, rate in {"scene": scene_rate, **pose_rates}.items() if rate},
         train,
         trainer,
         _data(problem),
@@ -108,17 +113,23 @@ def describe(config: Config, model: Model) -> dict[str, Any]:
 def _preset(config: Config, problem: Problem) -> Preset:
     if config.preset == "paper":
         return _PAPER_PRESET
-    return _FAST_PRESETS["all" if problem.slides else "axis" if config.axis_offset_deg else "positions"]
+    if problem.slides:
+        return _FAST_PRESETS["all"]
+    return _FAST_PRESETS["axis" if on_turntable(config, problem.recording) else "positions"]
 
 
-def _field(config: Config, problem: Problem, plan: Preset) -> tuple[PoseField, dict[str, Decay]]:
+def _field(config: Config, problem: Problem, plan: Preset) -> tuple[PoseField, dict[str, Decay | None]]:
     """The trajectory as a field, and the rates of its parameters."""
-    initial = fields.piecewise_geodesic(*(jnp.asarray(x, jnp.float32) for x in problem.start[:2]))
+    turn = rigid.make(
+        Rotation.from_euler("y", problem.turn_deg or 0.0, degrees=True).as_matrix(), np.zeros(3)
+    )
+    T_turned = problem.start.T @ turn
+    initial = fields.piecewise_geodesic(*(jnp.asarray(x, jnp.float32) for x in (problem.start.t, T_turned)))
     if config.pose == "linear":
         return initial, {}
     net = replace(config.net, layers=2, width=32) if config.smoke else config.net
     posenet = PoseNetConfig(span=problem.span, translation_scale=problem.extent / 2, **asdict(net))
-    rates = {"translation": plan.translation, "rotation": plan.rotation}
+    rates: dict[str, Decay | None] = {"translation": plan.translation, "rotation": plan.rotation}
     if config.net.coupled:
         rates = {"coupled": rates["rotation"]}
     # On the camera's side a wrong axis is a constant, and a chord of the circle comes near and goes away.

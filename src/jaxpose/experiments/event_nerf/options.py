@@ -4,6 +4,7 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.distance import pdist
@@ -14,11 +15,14 @@ from jaxpose.datasets.synthetic import event_orbit
 from jaxpose.datasets.synthetic.orbit import DIAMETER, FAR, NEAR
 from jaxpose.datasets.types import EventRecording
 from jaxpose.errors import DataError
-from jaxpose.events import Mosaic
+from jaxpose.events import Events, Mosaic, dead_time_s, hot_pixels, threshold_spread
 from jaxpose.events.contrast import find_displacement
+from jaxpose.events.ray_contrast import LEAST, find_turn_deg
 from jaxpose.experiments.checks import check_least, check_positive, check_run_folder, check_unused
 from jaxpose.experiments.devices import DeviceConfig, Precision, check_devices
-from jaxpose.experiments.training_loop import CHUNK, NetConfig
+from jaxpose.experiments.progress import OnUpdate, Update, silent
+from jaxpose.experiments.training_loop import CHUNK, NetConfig, pose_reader
+from jaxpose.fields import piecewise_geodesic
 from jaxpose.files.trajectories import Trajectory
 from jaxpose.training.events import Loss
 from jaxpose.training.photometric import Depths
@@ -115,6 +119,7 @@ class Problem(NamedTuple):
     background: float | None
     extent: float  # how far the camera moves [scene units]
     slides: bool  # whether nothing is known but that it slides
+    turn_deg: float | None  # of all cameras about their own y axes, as events tell; None: not looked for
     metadata: dict[str, Any]  # the data and what is wrong with the poses, in words and numbers
 
 
@@ -129,10 +134,29 @@ def read(config: Config) -> EventRecording:
         width = _SMOKE_WIDTH if config.smoke else config.image_width or _WIDTH
         poses = _SMOKE_POSES if config.smoke else 1000
         return event_orbit.event_orbit(width, config.seed, poses=poses, mosaic=config.mosaic or "rggb")
-    return event_registry.load_events(config.data, mosaic=config.mosaic)
+    return _without_hot_pixels(event_registry.load_events(config.data, mosaic=config.mosaic))
 
 
-def begin(config: Config, recording: EventRecording) -> Problem:
+def _without_hot_pixels(recording: EventRecording) -> EventRecording:
+    """The recording without events of pixels that never rest, which are counted."""
+    events, camera = recording.events, recording.camera
+    hot = hot_pixels(events, camera.height, camera.width)
+    left_out = hot[events.y, events.x]
+    if not left_out.any():
+        return recording
+    note = f"{int(hot.sum())} hot pixels, their {int(left_out.sum())} events are left out"
+    kept = Events(*(column[~left_out] for column in events))
+    return recording._replace(events=kept, notes=(*recording.notes, note))
+
+
+def _sensor(recording: EventRecording) -> dict[str, float | None]:
+    """What events tell of the sensor, in numbers."""
+    camera, events = recording.camera, recording.events
+    spread = threshold_spread(events, camera.height, camera.width) if recording.cyclic else None
+    return {"dead_time_s": dead_time_s(events), "threshold_spread": spread}
+
+
+def begin(config: Config, recording: EventRecording, on_update: OnUpdate = silent) -> Problem:
     """What of the recording's poses the training is told. DataError where it cannot be told."""
     orbiting = config.data == ORBIT
     if len(recording.events.t) == 0:
@@ -146,6 +170,10 @@ def begin(config: Config, recording: EventRecording) -> Problem:
             f"{began.start.t[0]:.4g} to {began.start.t[-1]:.4g} s"
         )
     camera = recording.camera
+    turn_deg = None
+    if _may_be_turned(config, recording):
+        on_update(Update("looking for the turntable's axis"))
+        turn_deg = _turn_deg(recording, began)
     metadata = {
         "data": "synthetic orbit with events" if orbiting else recording.name,
         "events": len(recording.events.t),
@@ -154,6 +182,8 @@ def begin(config: Config, recording: EventRecording) -> Problem:
         "mosaic": recording.mosaic,
         "extent": began.extent,
         "poses": began.words,
+        "turned_by_deg": turn_deg,
+        "sensor": _sensor(recording),
         "notes": recording.notes,
     }
     threshold = config.threshold or recording.threshold or 0.25
@@ -167,8 +197,35 @@ def begin(config: Config, recording: EventRecording) -> Problem:
         background,
         began.extent,
         config.poses == "unknown",
+        turn_deg,
         metadata,
     )
+
+
+def known_instants(config: Config) -> int | None:
+    """At how many instants positions are known; None: at all of the data's."""
+    if config.known is None and config.data == ORBIT and not config.axis_offset_deg:
+        return _KNOWN
+    return config.known
+
+
+def on_turntable(config: Config, recording: EventRecording) -> bool:
+    """Whether all positions are known, and the axis, as the camera sees it, may be wrong."""
+    every = config.poses == "known" and known_instants(config) is None
+    return every and (recording.cyclic or config.axis_offset_deg > 0)
+
+
+def _may_be_turned(config: Config, recording: EventRecording) -> bool:
+    """Whether a turn that all cameras share is looked for before poses are refined."""
+    doubted = on_turntable(config, recording) or config.axis_offset_deg > 0
+    return doubted and config.pose == "posenet" and len(recording.events.t) >= LEAST
+
+
+def _turn_deg(recording: EventRecording, began: "_Began") -> float:
+    """How far all cameras are to be turned about their own y axes, so that rays of events meet."""
+    start = piecewise_geodesic(*(jnp.asarray(x, jnp.float32) for x in began.start[:2]))
+    poses = lambda t: pose_reader(start, t)({})
+    return find_turn_deg(recording.camera, recording.events, poses, began.depths[:2])
 
 
 class _Began(NamedTuple):
@@ -205,9 +262,7 @@ def _known(config: Config, recording: EventRecording, orbiting: bool) -> _Began:
         raise DataError(
             f"{config.data}: expected poses at 2 instants or more, or --poses unknown, got {len(recording.t)}"
         )
-    known = config.known
-    if known is None and orbiting and not config.axis_offset_deg:
-        known = _KNOWN
+    known = known_instants(config)
     if known is not None and known > len(recording.t):
         raise DataError(f"--known: expected at most the {len(recording.t)} poses of the data, got {known}")
     T_start, words = _inexact(recording, known, config.axis_offset_deg)

@@ -62,7 +62,7 @@ def run(config: Config, on_update: OnUpdate = silent) -> Outcome:
     job = devices.join(config.devices, resume_fingerprint(config), on_update)
     on_update(Update("making the events" if config.data == ORBIT else f"reading {config.data}"))
     recording = read(config)
-    problem = begin(config, recording)
+    problem = begin(config, recording, on_update)
     with devices.opened(job, path) as folder:
         if config.study is None:
             return Outcome(folder, _single(config, problem, folder, job, on_update, ""))
@@ -70,7 +70,7 @@ def run(config: Config, on_update: OnUpdate = silent) -> Outcome:
         for label, changed in studies(config, config.study).items():
             changed = replace(changed, study=None)
             with run_folder.opened(folder / label) as inner:
-                begun = begin(changed, recording)
+                begun = begin(changed, recording, on_update)
                 results[label] = _single(changed, begun, inner, job, on_update, label)
         return training_loop.write_study(folder, "event_nerf", config, results, table(results), started)
 

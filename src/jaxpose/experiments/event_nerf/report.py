@@ -84,6 +84,20 @@ def _more(run: dict[str, Any]) -> list[str]:
         lines.append(
             f"  axis         off by {run['constant_rotation_error_deg']:.2f} deg as found (mean turn)"
         )
+    sensor = run["data"]["sensor"]
+    if sensor["dead_time_s"] is not None:
+        lines.append(
+            f"  dead time    {1e3 * sensor['dead_time_s']:.2f} ms of a pixel after an event, at most"
+        )
+    if sensor["threshold_spread"] is not None:
+        lines.append(
+            f"  thresholds   spread {100 * sensor['threshold_spread']:.1f}% over pixels, by their balance"
+        )
+    turned = run["data"]["turned_by_deg"]
+    if turned is not None:
+        lines.append(
+            f"  turned       all cameras by {turned:.2f} deg about their y axes, by contrast of events"
+        )
     if "frames" in run:
         frames = run["frames"]
         lines.append(
