@@ -7,7 +7,7 @@ then cameras and points are where rays pass the points closest (one linear probl
 import numpy as np
 import scipy.linalg
 import scipy.sparse as sp
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 
 from jaxpose.estimate.pose_graph import Edges, optimise_pose_graph
@@ -107,12 +107,7 @@ def _places(tracks: Tracks, R: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, 
     return centre / usual
 
 
-def _closest(
-    by_view: sp.csr_matrix,
-    by_point: sp.csr_matrix,
-    point: Int[np.ndarray, " o"],
-    across: Float[np.ndarray, "o 3 3"],
-) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "m 3"]]:
+def _closest(by_view, by_point, point, across) -> tuple[np.ndarray, np.ndarray]:
     """Centres and points of the least sum of squares, by an eigenvector, the points eliminated."""
     n, m = by_view.shape[0], by_point.shape[0]
     total = lambda which: (which @ across.reshape(-1, 9)).reshape(-1, 3, 3)

@@ -340,7 +340,10 @@ def importance(
         shift = 0.5 if key is None else jax.random.uniform(key, ())
         wanted = (jnp.arange(samples + 1, dtype=total.dtype) + shift) / (samples + 1) * total[-1]
         part = jnp.clip(jnp.searchsorted(total, wanted, side="right") - 1, 0, coarse - 1)
-        cut = edges[part] + (wanted - total[part]) / weight[part] * width[part]
+        # Rounding must not leave the part: the last one may be endless, and a sample before it would be
+        # behind the camera.
+        share = jnp.clip((wanted - total[part]) / weight[part], 0, 1)
+        cut = edges[part] + share * width[part]
         depth = jnp.append((cut[1:] + cut[:-1]) / 2, edges[-1])
         return jax.lax.stop_gradient(Samples(depth, jnp.append(jnp.diff(cut), render.ENDLESS)))
 

@@ -46,6 +46,9 @@ _NET_RATES = {
     "paper": ((1e-3, 1e-5), (2e-4, 1e-6)),
     "noisy": ((3e-4, 2e-5), (3e-4, 2e-5)),
     "unknown": ((6e-4, 4e-5), (2e-3, 1e-4)),
+    # Cameras that look one way: colours hardly tell a turn that all share from a tilt of the plane that
+    # they stand in. Features do, and the noise of steps as large as an orbit's would take it away.
+    "forward": ((3e-6, 3e-7), (3e-6, 3e-7)),
 }
 _PER_FRAME_RATES = {  # also of splines; with preset paper BARF's
     "noisy": ((3e-3, 1e-4), (3e-3, 1e-4)),
@@ -288,7 +291,8 @@ def _rates(
     else:
         shift, turn = _PER_FRAME_RATES[start]
     if registered is not None:
-        shift, turn = (_NET_RATES if config.pose == "posenet" else _PER_FRAME_RATES)["noisy"]
+        of_net = _NET_RATES["forward" if problem.train.spacing == "disparity" else "noisy"]
+        shift, turn = of_net if config.pose == "posenet" else _PER_FRAME_RATES["noisy"]
         formed = min(max(_FORMED_RAYS / (train.rays * train.steps), _REGISTERED_FROM), 0.5)
         return {"translation": Decay(*shift, formed), "rotation": Decay(*turn, formed)}
     shift_from, turn_from = (0.0, 0.0) if paper else (_SHIFT_FROM, _TURN_FROM)
