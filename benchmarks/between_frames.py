@@ -18,7 +18,7 @@ from jaxpose.experiments.slam.options import slam_config
 from jaxpose.experiments.slam.source import load
 from jaxpose.fields import numpy_evaluator
 from jaxpose.geometry import rigid
-from jaxpose.slam.batch import own_covariances
+from jaxpose.slam.batch import SEEN_AGAIN_S, own_covariances
 from jaxpose.slam.pipeline import run
 
 
@@ -46,7 +46,7 @@ def main() -> None:
         known = smooth(
             t[kept], tracked[kept], own[kept], imu, use=use, noise=config.slam.imu_noise,
             T_body_cam=recording.T_body_cam, gravity_world=recording.gravity_world,
-            drift=2 * own[kept],  # the map was made from all
+            drift=2 * own[kept], drift_s=SEEN_AGAIN_S,  # the map was made from all
         )  # fmt: skip
         show(f"left out: by {' and '.join(use)}", known.pose(t[out]), truth[out])
 

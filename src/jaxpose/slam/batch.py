@@ -19,7 +19,7 @@ from jaxpose.slam.types import Frames, SlamState, TrackingStatus
 
 _FEWEST = 4  # poses that an estimate can be made of
 _UNKNOWN = 1.0  # [m, rad] sigma of a pose that ends the run and is in doubt
-_SEEN_AGAIN_S = 4.0  # in which the map's error is forgotten: experiments/estimate.md
+SEEN_AGAIN_S = 4.0  # in which the map's error is forgotten: experiments/estimate.md
 _ALIKE = 4  # registered frames to either side whose covariances are averaged: that of one is of 16 numbers
 
 
@@ -106,7 +106,7 @@ def estimate_trajectory(state: SlamState, imu: Imu | None) -> tuple[Posterior | 
         gravity_world=state.gravity_world,
     )
     if config.imu == "combined":
-        posterior = estimated(drift=own, drift_s=_SEEN_AGAIN_S)
+        posterior = estimated(drift=own, drift_s=SEEN_AGAIN_S)
         if max(posterior.noise.position, posterior.noise.rotation) < 1:
             return posterior, None
     return estimated(), tracked_covariances(t, T_world_cam, own)
