@@ -26,6 +26,7 @@ from jaxpose.experiments import imu_slam, rgbd_slam
 from jaxpose.experiments.outcome import Outcome
 from jaxpose.experiments.slam.evaluation import orientation_error_deg
 from jaxpose.experiments.slam.report import report, table, tracking_update
+from jaxpose.experiments.slam.run_files import _write_trajectory
 from jaxpose.experiments.slam.source import load
 from jaxpose.fields import numpy_evaluator
 from jaxpose.files import atomic, trajectories
@@ -382,3 +383,24 @@ def test_help_all_lists_the_options(capsys):
 def test_defaults():
     assert imu_slam.Config().slam.imu == "combined" and rgbd_slam.Config().slam.imu == "none"
     assert imu_slam.Config().slam == replace(rgbd_slam.Config().slam, imu="combined")
+
+
+def test_a_run_is_written_on_the_clock_of_its_files(tmp_path, unchecked):
+    """Timestamps since 1970, from the third frame on: to the last digit, and the field with them."""
+    t0_ns, t = 1_305_031_229_528_748_123, np.arange(6) / 5 + 0.4
+    poses = np.tile(np.eye(4), (6, 1, 1))
+    poses[:, 0, 3] = np.arange(6)
+    fitted = fields.fit(fields.bspline((0.0, 1.0), 5), t - t[0], poses)
+    recording = SimpleNamespace(t=t, t0_ns=t0_ns, T_world_cam=poses)
+    known = fields.Covariances(t - t[0], np.tile(np.eye(6), (6, 1, 1)), np.eye(6)[None])
+    result = SimpleNamespace(
+        T_world_cam=poses, field=fitted.field, field_params=fitted.params, covariances=known
+    )
+    _write_trajectory(tmp_path, SimpleNamespace(recording=recording, origin=np.zeros(3)), result)
+    for name in ("trajectory", "reference"):
+        first = (tmp_path / f"{name}.txt").read_text().splitlines()[1]
+        assert first.split()[0] == "1305031229.928748123"
+    times = t0_ns / 1e9 + t
+    np.testing.assert_allclose(numpy_evaluator.load(tmp_path / "field.npz")(times), poses, atol=1e-4)
+    sure = numpy_evaluator.load_covariance(tmp_path / "field.npz")
+    np.testing.assert_allclose(sure(times[[0, 5]]), [np.eye(6)] * 2)

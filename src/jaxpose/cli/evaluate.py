@@ -322,17 +322,15 @@ def _consistency(config: Config, pairs: _Pairs, alignment: Similarity) -> dict[s
 
     Errors half a second apart and more are counted as independent.
     """
-    from jaxpose.fields import numpy_evaluator
+    from jaxpose.fields import _entries, numpy_evaluator
 
     file = config.estimate / FIELD
     if not pairs.exact:
         raise DataError(f"{config.estimate}: --consistency expected a run and timestamps, to match exactly")
-    try:
-        of_pose, of_second = (
-            numpy_evaluator.load_covariance(file, name) for name in ("covariance", "relative_covariance")
-        )
-    except ValueError as error:
-        raise DataError(str(error)) from None
+    known = _entries.read_entries(file)
+    if "covariance" not in known:
+        raise DataError(f"{file}: expected covariance, got a trajectory without")
+    of_pose = numpy_evaluator.load_covariance(file)
     t = pairs.t
     P = of_pose(t)
     aligned = trajectory_error.align(alignment, pairs.estimate)
@@ -341,7 +339,10 @@ def _consistency(config: Config, pairs: _Pairs, alignment: Similarity) -> dict[s
     found = {"poses after alignment": consistency(error, P, independent=independent(t))}
     later = np.searchsorted(t, t + 1.0 - 1e-6)
     i = np.flatnonzero((later < len(t)) & (np.abs(t[np.minimum(later, len(t) - 1)] - t - 1.0) < 1e-3))
+    seconds = known.get("relative_covariance", ())
+    i = i[t[i] <= known["covariance_times"][len(seconds) - 1]] if len(seconds) else i[:0]
     if len(i):
+        of_second = numpy_evaluator.load_covariance(file, "relative_covariance")
         j = later[i]
         moves = relative_error(
             (pairs.estimate[i], pairs.estimate[j]), (pairs.reference[i], pairs.reference[j])

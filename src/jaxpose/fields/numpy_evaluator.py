@@ -60,9 +60,10 @@ def load_covariance(path, name="covariance"):
         t = np.atleast_1d(np.asarray(t, float))
         if not ((t >= times[0] - 1e-6) & (t <= times[-1] + 1e-6)).all():  # a file's digits
             raise ValueError(f"t: expected times between {times[0]:.6g} and {times[-1]:.6g} s, got {t}")
-        i = np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(times) - 2)
-        share = np.clip((t - times[i]) / (times[i + 1] - times[i]), 0, 1)[:, None, None]
-        return (1 - share) * known[i] + share * known[i + 1]
+        j = np.clip(np.searchsorted(times, t, side="right"), 1, max(len(times) - 1, 1)) % len(times)
+        i = np.maximum(j - 1, 0)
+        share = np.clip((t - times[i]) / np.maximum(times[j] - times[i], 1e-9), 0, 1)[:, None, None]
+        return (1 - share) * known[i] + share * known[j]
 
     return covariance
 

@@ -23,7 +23,7 @@ from jaxpose.experiments.slam.map_file import SavedMap, write_map
 from jaxpose.experiments.slam.map_rendering import Renderer, renderer, views
 from jaxpose.experiments.slam.options import Options
 from jaxpose.experiments.slam.source import Source
-from jaxpose.fields import save
+from jaxpose.fields import save, shifted
 from jaxpose.files import atomic, trajectories
 from jaxpose.files.camera_json import write_camera
 from jaxpose.files.ply import write_ply
@@ -98,19 +98,24 @@ def _coarser_notes(options: Options, result: SlamResult) -> tuple[str, ...]:
 
 
 def _write_trajectory(folder: Path, source: Source, result: SlamResult) -> None:
-    """The poses of the frames, the ground truth, and the continuous trajectory, in the world of the files."""
-    t, ground_truth, origin = source.recording.t, source.recording.T_world_cam, source.origin
-    in_files = lambda T: trajectories.Trajectory(t, moved(T, origin))
+    """The poses of the frames, the ground truth, and the continuous trajectory.
+
+    In the world of the recording's files, and on their clock.
+    """
+    recording, origin = source.recording, source.origin
+    ground_truth, known = recording.T_world_cam, result.covariances
+    in_files = lambda T: trajectories.Trajectory(recording.t, moved(T, origin), recording.t0_ns)
+    first = recording.t0_ns / 10**9 + float(recording.t[0])
     trajectories.write_tum(folder / "trajectory.txt", in_files(result.T_world_cam))
     if ground_truth is not None:
         trajectories.write_tum(folder / "reference.txt", in_files(ground_truth))
     alignment = Similarity(1.0, np.eye(3), origin) if origin.any() else None
     save(
         folder / "field.npz",
-        result.field,
+        shifted(result.field, first),
         result.field_params,
         alignment=alignment,
-        covariance=result.covariances,
+        covariance=known and known._replace(t=known.t + first),
     )
 
 
