@@ -28,7 +28,7 @@ FIELD_SIGMAS = ResidualSigmas(loose=0.004, tight=0.1, accelerometer=1.0)
 _USUAL = 30  # frames that say what is usual
 # Errors of poses by features that stay from frame to frame (colour beside depth, a rolling shutter), which no
 # number of frames averages out.
-GO_TOGETHER = 10.0
+_GO_TOGETHER = 10.0
 _ENOUGH = 60  # features of keyframes: with fewer those of the last frame are taken too, which drift
 _MATCHED = 3  # images that a frame's features are matched with
 FIRST_FEATURE_SCALE = (
@@ -332,12 +332,12 @@ def with_features(
     lead there.
     """
     frames, i, T_body_cam = state.frames, state.frames.count - 1, state.T_body_cam
-    support = np.linalg.inv(seen.covariance) / GO_TOGETHER
+    support = np.linalg.inv(seen.covariance) / _GO_TOGETHER
     if frames.doubted[i - 1]:
         T_predicted = frames.T_world_body[i - 1] @ predicted.T_ref_body[-1]
         T_world_body = seen.T_world_cam @ rigid.inverse(T_body_cam)
         frames = frames.corrected(rigid.inverse(T_predicted) @ T_world_body)
-        covariance, fused = GO_TOGETHER * seen.covariance, T_world_body
+        covariance, fused = _GO_TOGETHER * seen.covariance, T_world_body
     else:
         T_world_predicted = _predicted_camera(state, frames, predicted)
         apart = rigid.log(rigid.inverse(seen.T_world_cam) @ T_world_predicted)
@@ -345,7 +345,7 @@ def with_features(
         expected = np.linalg.inv(predicted.covariance)
         if apart @ np.linalg.solve(both, apart) > CHI2_999:
             expected = np.zeros((6, 6))
-        share = np.linalg.solve(GO_TOGETHER * support + expected, expected)
+        share = np.linalg.solve(_GO_TOGETHER * support + expected, expected)
         fused = seen.T_world_cam @ rigid.exp(share @ apart) @ rigid.inverse(T_body_cam)
         covariance = np.linalg.inv(support + expected)
     T_ref_body = rigid.inverse(frames.T_world_body[i - 1]) @ fused

@@ -19,7 +19,7 @@ from jaxpose.losses import weighted_mean
 from jaxpose.slam.config import TrackConfig
 from jaxpose.slam.map.integrate import MapQuery, MapSampler
 from jaxpose.slam.observation import Image, Pixels, back_project, depth_sigma, sample_pixels
-from jaxpose.slam.tracking.predict import AHEAD, GO_TOGETHER, TrackingProblem
+from jaxpose.slam.tracking.predict import AHEAD, TrackingProblem
 
 _SETTLED = 2e-4  # [m, rad] a step this small ends the alignment
 _INDEPENDENT = 100.0  # pixels
@@ -310,14 +310,9 @@ def pose_sigma(found: Registration, support: Float[Array, "6 6"]) -> Float[Array
 
 
 def pose_covariance(found: Registration, problem: TrackingProblem) -> Float[Array, "6 6"]:
-    """Covariance of a registered pose beside the map, over right increments of the camera.
-
-    Of the prediction's error what features share from frame to frame is no part: it moves map and pose alike.
-    """
-    predicted = jnp.linalg.inv(jnp.linalg.inv(problem.covariance) + (GO_TOGETHER - 1) * problem.support)
-    return found.by_parts + jnp.einsum(
-        "ij,jk,lk->il", found.share, predicted, found.share, precision="highest"
-    )
+    """Covariance of a registered pose beside the map, over right increments of the camera."""
+    share = found.share
+    return found.by_parts + jnp.einsum("ij,jk,lk->il", share, problem.covariance, share, precision="highest")
 
 
 def image_information(found: Registration) -> Float[Array, "6 6"]:
