@@ -64,8 +64,10 @@ def test_frames_in_doubt_have_no_covariance_of_their_own():
     frames = frames.put(7, status=TrackingStatus.LOST)
     own = own_covariances(frames)
     assert np.isnan(own[7]).all()
-    np.testing.assert_allclose(own[6], measured[[1, 2, 3, 4, 5, 7, 8, 9, 10]].mean(0))
+    np.testing.assert_allclose(own[6], measured[[1, 2, 3, 4, 5, 7, 8, 9, 10]].mean(0), atol=1e-9)
     np.testing.assert_allclose(own[0], own[1])
+    flat = frames.put(np.arange(1, 20), covariance=np.diag([1.0, 1, 1, 1, 1, -1e-14]))  # as float32 rounds
+    assert np.linalg.eigvalsh(own_covariances(flat)[3])[0] > 1e-11
     ended = own_covariances(frames.put(19, status=TrackingStatus.LOST))
     np.testing.assert_allclose(ended[19], np.eye(6))  # not known, but there
     assert np.isnan(own_covariances(no_frames(np.arange(3.0)))).all()

@@ -20,6 +20,7 @@ from jaxpose.slam.types import Frames, SlamState, TrackingStatus
 _FEWEST = 4  # poses that an estimate can be made of
 _UNKNOWN = 1.0  # [m, rad] sigma of a pose that ends the run and is in doubt
 SEEN_AGAIN_S = 4.0  # in which the map's error is forgotten: experiments/estimate.md
+_RESOLVED = 1e-5  # [m, rad] that poses in float32 resolve
 _ALIKE = 4  # registered frames to either side whose covariances are averaged: that of one is of 16 numbers
 
 
@@ -85,11 +86,8 @@ def estimate_trajectory(state: SlamState, imu: Imu | None) -> tuple[Posterior | 
     kept = np.isfinite(own).all(axis=(1, 2))
     if config.uses_field or kept.sum() < _FEWEST:
         return None, None
-    own, t, T_world_cam = (
-        own[kept],
-        frames.t[kept] - frames.t[0],
-        frames.T_world_body[kept] @ state.T_body_cam,
-    )
+    own, t = own[kept], frames.t[kept] - frames.t[0]
+    T_world_cam = frames.T_world_body[kept] @ state.T_body_cam
     if imu is None or not config.uses_gyroscope:
         return None, tracked_covariances(t, T_world_cam, own)
     use = {"accelerometer": ("accelerometer",), "combined": ("gyroscope", "accelerometer")}
@@ -120,6 +118,7 @@ def own_covariances(frames: Frames) -> Float[np.ndarray, "n 6 6"]:
     registered = (frames.status <= TrackingStatus.WEAK) & np.isfinite(frames.covariance).all(axis=(1, 2))
     found = np.full((frames.count, 6, 6), np.nan)
     measured, index = frames.covariance[registered], np.flatnonzero(registered)
+    measured = (measured + np.swapaxes(measured, 1, 2)) / 2 + _RESOLVED**2 * np.eye(6)
     for k, i in enumerate(index):
         found[i] = measured[max(k - _ALIKE, 0) : k + _ALIKE + 1].mean(axis=0)
     if len(index):
