@@ -330,7 +330,7 @@ def _consistency(config: Config, pairs: _Pairs, alignment: Similarity) -> dict[s
     known = _entries.read_entries(file)
     if "covariance" not in known:
         raise DataError(f"{file}: expected covariance, got a trajectory without")
-    of_pose = numpy_evaluator.load_covariance(file)
+    of_pose = numpy_evaluator.load_covariance(known)
     t = pairs.t
     P = of_pose(t)
     aligned = trajectory_error.align(alignment, pairs.estimate)
@@ -342,7 +342,7 @@ def _consistency(config: Config, pairs: _Pairs, alignment: Similarity) -> dict[s
     seconds = known.get("relative_covariance", ())
     i = i[t[i] <= known["covariance_times"][len(seconds) - 1]] if len(seconds) else i[:0]
     if len(i):
-        of_second = numpy_evaluator.load_covariance(file, "relative_covariance")
+        of_second = numpy_evaluator.load_covariance(known, "relative_covariance")
         j = later[i]
         moves = relative_error(
             (pairs.estimate[i], pairs.estimate[j]), (pairs.reference[i], pairs.reference[j])

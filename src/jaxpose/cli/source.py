@@ -127,10 +127,11 @@ def read_covariance(
         return None, "without covariances"
     from jaxpose.fields import _entries, numpy_evaluator  # here, as their room loads jax
 
-    if "covariance" not in _entries.read_entries(file):
+    known = _entries.read_entries(file)
+    if "covariance" not in known:
         return None, f"without covariances, which {FIELD} does not have"
     try:
-        return numpy_evaluator.load_covariance(file)(trajectories.since(trajectory, 0)), "with covariances"
+        return numpy_evaluator.load_covariance(known)(trajectories.since(trajectory, 0)), "with covariances"
     except ValueError as error:  # of times beyond those that are known
         return None, f"without covariances: {str(error)[:80]}"
 

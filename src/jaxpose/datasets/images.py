@@ -225,17 +225,12 @@ def natural_order(name: str) -> list[tuple[int, str]]:
     return [(len(part) if k % 2 else 0, part) for k, part in enumerate(numbers)]
 
 
-def may_exist(name: str) -> bool:
-    """Whether a file system can hold a path of this name; of a longer one it says so as of a fault."""
-    return len(name) <= _LONGEST_NAME or max(map(len, name.split("/"))) <= _LONGEST_NAME
-
-
-_LONGEST_NAME = 255  # of a file, in any file system; and characters of an item of a list that are shown
+_SHOWN = 255  # characters of an item of a list
 
 
 def some(items: Sequence[str], most: int = 5) -> str:
     """The first few of a list, for a message of one line."""
-    shown = [item if len(item) <= _LONGEST_NAME else f"{item[:_LONGEST_NAME]}..." for item in items[:most]]
+    shown = [item if len(item) <= _SHOWN else f"{item[:_SHOWN]}..." for item in items[:most]]
     return ", ".join(shown) + (", ..." if len(items) > most else "")
 
 

@@ -10,11 +10,27 @@ from typing import Any
 
 import numpy as np
 
+from jaxpose.datasets.rgbd.frames import visible
 from jaxpose.errors import DataError
 
 EXTRA = 'pip install -e ".[video]"'
 SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm")
 _NEAR = 8  # frames ahead that are decoded on the way instead of sought
+
+
+def find_video(path: Path, suffixes: Sequence[str] = SUFFIXES) -> Path | None:
+    """The video at a path.
+
+    Args:
+        path: A file or folder.
+        suffixes: Of what counts as a video, in lower case.
+
+    Returns:
+        The file itself, or the only one in the folder; None where there is none, or more.
+    """
+    files = visible(path) if path.is_dir() else [path]
+    videos = [file for file in files if file.suffix.lower() in suffixes and file.is_file()]
+    return videos[0] if len(videos) == 1 else None
 
 
 @contextmanager

@@ -6,7 +6,6 @@ are, as variance does for images of warped events (Gallego et al., CVPR 2018).
 
 from collections.abc import Callable
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import gaussian_filter
@@ -14,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxpose.errors import DataError
 from jaxpose.events.types import Events, check_events
-from jaxpose.geometry.camera import Camera, unproject
+from jaxpose.geometry.camera import Camera, unproject_numpy
 
 LEAST, _MOST = 1000, 30_000  # events that are used
 _CELLS, _DEPTHS = 96, 64  # voxels along a side, and points along a ray
@@ -55,8 +54,8 @@ def find_turn_deg(
         raise DataError(f"axis from events: expected at least {LEAST} events, got {len(events.t)}")
     generator, (near, far) = np.random.default_rng(0), depths
     some = np.sort(generator.permutation(len(events.t))[:_MOST])
-    pixels = np.stack([events.x[some], events.y[some]], axis=-1).astype(np.float32)
-    directions, T = np.asarray(unproject(camera, jnp.asarray(pixels))), poses(events.t[some])
+    pixels = np.stack([events.x[some], events.y[some]], axis=-1).astype(np.float64)
+    directions, T = unproject_numpy(camera, pixels), poses(events.t[some])
     depth = near + (far - near) * (np.arange(_DEPTHS) + generator.random((len(some), 1))) / _DEPTHS
     sign = (events.polarity[some] > 0).astype(np.int64)[:, None]
 

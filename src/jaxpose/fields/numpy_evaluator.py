@@ -40,7 +40,7 @@ def load_covariance(path, name="covariance"):
     """How sure a trajectory is.
 
     Args:
-        path: a `field.npz` of a run that knows.
+        path: a `field.npz` of a run that knows, or a dict of what it holds.
         name: "covariance", of the pose, or "relative_covariance", of the move in the second that follows.
 
     Returns:
@@ -50,11 +50,12 @@ def load_covariance(path, name="covariance"):
     Raises:
         ValueError: a file without covariances.
     """
-    with np.load(path, allow_pickle=False) as file:
-        if name not in file:
-            raise ValueError(f"{path}: expected {name}, got a trajectory without")
-        times, known = file["covariance_times"], file[name]
-        times = times[: len(known)]
+    if not isinstance(path, dict):
+        with np.load(path, allow_pickle=False) as file:
+            if name not in file:
+                raise ValueError(f"{path}: expected {name}, got a trajectory without")
+            return load_covariance(dict(file), name)
+    times, known = path["covariance_times"][: len(path[name])], path[name]
 
     def covariance(t):
         t = np.atleast_1d(np.asarray(t, float))

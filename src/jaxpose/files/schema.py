@@ -154,6 +154,16 @@ def rigid_transforms(path: Path | str, key: str, T: Float[np.ndarray, "n 4 4"]) 
 _LONGEST_NAME = 255  # bytes, in any file system
 
 
+def may_exist(name: str) -> bool:
+    """Whether a file system can hold a path of this name; of a longer one it says so as of a fault."""
+    return len(name) <= _LONGEST_NAME // 4 or _longest(name) <= _LONGEST_NAME
+
+
+def _longest(name: str) -> int:
+    """Bytes of the longest part of a path."""
+    return max(len(part.encode("utf-8", "surrogatepass")) for part in name.split("/"))
+
+
 def name_inside(path: Path | str, name: str) -> str:
     """A file name that leads nowhere but into the folder it is of.
 
@@ -170,9 +180,8 @@ def name_inside(path: Path | str, name: str) -> str:
     leads_up = ".." in name and ".." in name.replace("\\", "/").split("/")
     if not name or "\0" in name or name.startswith(("/", "\\")) or leads_up:
         raise DataError(f"{path}: expected a file name that stays in its folder, got {name!r:.60}")
-    longest = max(len(part.encode("utf-8", "surrogatepass")) for part in name.split("/"))
-    if longest > _LONGEST_NAME:
-        raise DataError(f"{path}: expected file names of up to {_LONGEST_NAME} bytes, got {longest}")
+    if not may_exist(name):
+        raise DataError(f"{path}: expected file names of up to {_LONGEST_NAME} bytes, got {_longest(name)}")
     return name
 
 

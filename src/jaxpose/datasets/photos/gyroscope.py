@@ -12,6 +12,7 @@ from jaxpose.datasets.rgbd.frames import visible
 from jaxpose.datasets.rgbd.imu_csv import read_rates
 from jaxpose.datasets.video import Video
 from jaxpose.errors import DataError
+from jaxpose.geometry.rigid import nearest_rotation
 
 _WIDTH, _FRAMES = 240, 300  # px, and frames from the first on that are looked at
 _FEWEST = 12  # features, or frames, that a rotation is told by
@@ -40,7 +41,8 @@ def find_readings(video: Path) -> Path | None:
     tables = [file for file in visible(video.parent) if file.suffix.lower() in (".csv", ".txt")]
     found = [file for file in tables if _has_rates(file)]
     named = [file for file in found if file.stem.lower().startswith(video.stem.lower())]
-    return (named or found)[0] if len(named or found) == 1 or named else None
+    chosen = named or (found if len(found) == 1 else [])
+    return chosen[0] if chosen else None
 
 
 def _has_rates(file: Path) -> bool:
@@ -131,8 +133,7 @@ class _Fit(NamedTuple):
 
 def _fit(seen: Float[np.ndarray, "k 3"], read: Float[np.ndarray, "k 3"]) -> _Fit:
     """How `read` is turned and scaled to be as `seen`."""
-    u, _, v = np.linalg.svd(seen.T @ read)
-    turn = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ v))]) @ v
+    turn = nearest_rotation(seen.T @ read)
     total = float((read**2).sum())
     scale = float((seen * (read @ turn.T)).sum()) / max(total, 1e-12)
     left = float(((seen - scale * read @ turn.T) ** 2).sum())

@@ -5,7 +5,8 @@ import re
 from collections.abc import Callable
 from pathlib import Path, PurePosixPath
 
-from jaxpose.datasets.images import SUFFIXES, may_exist, natural_order
+from jaxpose.datasets.images import SUFFIXES, natural_order
+from jaxpose.files.schema import may_exist
 
 
 def images_in(folder: Path) -> list[Path]:

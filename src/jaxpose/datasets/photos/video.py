@@ -9,9 +9,8 @@ from scipy.spatial.transform import Rotation
 from jaxpose.datasets.images import name_of
 from jaxpose.datasets.photos.gyroscope import align, find_readings, orientations
 from jaxpose.datasets.photos.pixels import smaller_view
-from jaxpose.datasets.rgbd.frames import visible
 from jaxpose.datasets.types import Photographs, take
-from jaxpose.datasets.video import SUFFIXES, Video
+from jaxpose.datasets.video import Video, find_video
 from jaxpose.errors import DataError
 from jaxpose.geometry.camera import Camera
 
@@ -28,7 +27,7 @@ def detect(path: Path) -> bool:
     Returns:
         Whether `load` should read it.
     """
-    return _file(path) is not None
+    return find_video(path) is not None
 
 
 def load(
@@ -52,7 +51,7 @@ def load(
         DataError: Naming the file for anything that cannot be used, and where no focal length is given.
         ValueError: For a width below 1.
     """
-    file = _file(Path(path))
+    file = find_video(Path(path))
     if file is None:
         raise DataError(f"{path}: expected a video, got none")
     video = Video(file)
@@ -96,10 +95,3 @@ def _turns(
         return None, (found,)
     shown = Rotation.from_rotvec([0, 0, -np.pi / 2 * video.quarter_turns]).as_matrix()
     return shown @ orientations(found, t) @ shown.T, (found.note,)
-
-
-def _file(path: Path) -> Path | None:
-    """The video, itself or the only one in a folder."""
-    files = visible(path) if path.is_dir() else [path]
-    videos = [file for file in files if file.suffix.lower() in SUFFIXES and file.is_file()]
-    return videos[0] if len(videos) == 1 else None

@@ -16,7 +16,6 @@ from jaxpose.datasets.images import (
     common_size,
     depth_unit,
     image_size,
-    may_exist,
     name_of,
     read_color,
     read_depth,
@@ -26,7 +25,7 @@ from jaxpose.datasets.images import (
 )
 from jaxpose.datasets.types import Frame, Recording
 from jaxpose.errors import DataError
-from jaxpose.files.schema import FARTHEST_M, name_inside
+from jaxpose.files.schema import FARTHEST_M, may_exist, name_inside
 from jaxpose.files.tables import seconds
 from jaxpose.geometry.camera import Camera, resized
 

@@ -145,7 +145,7 @@ def read_rates(file: Path | str) -> Rates:
     if len(rows.ns) < 2:
         raise DataError(f"{file}: expected at least 2 readings, got {len(rows.ns)}")
     text = named.stated["wx"]
-    factor = _TO_SI.get(text.lower().replace(" ", "").replace("\u00b0", "deg")) if text else None
+    factor = _factor(text) if text else None
     return Rates(rows.ns, (factor or 1.0) * rows.values, text if factor else None)
 
 
@@ -175,13 +175,18 @@ def _to_si(file: Path, named: Named | None) -> tuple[tuple[float, float], tuple[
     factors, notes = [], []
     for name, quantity in (("wx", "the gyroscope"), ("ax", "the accelerometer")):
         stated = "" if named is None else named.stated[name]
-        factor = _TO_SI.get(stated.lower().replace(" ", "").replace("\u00b0", "deg").replace("*", ""))
+        factor = _factor(stated)
         if factor is None:
             notes.append(f"{file.name}: unit {stated!r} of {quantity} is not known: taken as SI")
         elif factor != 1:
             notes.append(f"{file.name}: {quantity} is in {stated}, by the header: multiplied by {factor:.6g}")
         factors.append(factor or 1.0)
     return (factors[0], factors[1]), tuple(notes)
+
+
+def _factor(unit: str) -> float | None:
+    """What brings a unit as headers write it to SI; None for one that is not known."""
+    return _TO_SI.get(unit.lower().replace(" ", "").replace("\u00b0", "deg").replace("*", ""))
 
 
 def read_mounting(file: Path | str) -> CameraImu:

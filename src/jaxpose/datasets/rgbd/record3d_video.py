@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Float32
 
 from jaxpose.datasets.images import check_intrinsics
-from jaxpose.datasets.rgbd.frames import Images, Poses, assembled, visible
+from jaxpose.datasets.rgbd.frames import Images, Poses, assembled
 from jaxpose.datasets.rgbd.phones import Y_UP
 from jaxpose.datasets.types import Recording
-from jaxpose.datasets.video import Video
+from jaxpose.datasets.video import Video, find_video
 from jaxpose.errors import DataError
 from jaxpose.files.schema import numbers
 from jaxpose.files.untrusted import json_object, read_json
@@ -33,7 +33,7 @@ def detect(path: Path) -> bool:
     Returns:
         Whether `load` should read it.
     """
-    file = _file(path)
+    file = find_video(path, _SUFFIXES)
     return file is not None and _metadata(file) is not None
 
 
@@ -53,7 +53,7 @@ def load(path: Path) -> Recording:
     Raises:
         DataError: Naming the file for anything that cannot be used.
     """
-    file = _file(path)
+    file = find_video(path, _SUFFIXES)
     content = None if file is None else _metadata(file)
     if file is None or content is None:
         raise DataError(f"{path}: expected Record3D's RGBD video with its metadata, got none")
@@ -90,13 +90,6 @@ def _depth(pixels: np.ndarray, near: float, far: float) -> Float32[np.ndarray, "
     hue /= 360
     known = (np.abs(hue - 0.5) < 0.5 - _RED) & (np.minimum(saturation, value) > _COLOURFUL)
     return np.where(known, near + (far - near) * hue, 0).astype(np.float32)
-
-
-def _file(path: Path) -> Path | None:
-    """The video, itself or the only one in a folder."""
-    files = visible(path) if path.is_dir() else [path]
-    videos = [file for file in files if file.suffix.lower() in _SUFFIXES and file.is_file()]
-    return videos[0] if len(videos) == 1 else None
 
 
 def _metadata(file: Path) -> dict[str, Any] | None:
