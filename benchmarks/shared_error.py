@@ -1,4 +1,4 @@
-"""What it changes that tracked poses share an error: `python benchmarks/shared_error.py`, options of imu_slam.
+"""What it changes that tracked poses share an error: `python benchmarks/shared_error.py`, imu_slam's options.
 
 A recording is tracked once; the batch pass then takes the poses' errors for independent, or for a walk that
 is forgotten in so many seconds. Printed are the ATE, and squared errors over covariances of poses and of
@@ -43,9 +43,8 @@ def main() -> None:
         )  # fmt: skip
         name = "independent" if forgotten_s is None else f"a walk, forgotten in {forgotten_s:g} s"
         levels = f"{known.noise.position:.2f}, {known.noise.rotation:.2f}"
-        print(
-            f"  {name:<28} ATE {ate(known.pose(t), truth):.3f} cm, {squares(known, t, truth)}, factors {levels}"
-        )
+        off = f"ATE {ate(known.pose(t), truth):.3f} cm"
+        print(f"  {name:<28} {off}, {squares(known, t, truth)}, factors {levels}")
 
 
 def ate(T, truth) -> float:
