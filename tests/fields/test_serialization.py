@@ -11,6 +11,7 @@ import pytest
 
 from jaxpose import fields
 from jaxpose.errors import DataError
+from jaxpose.estimate.posterior import table_times
 from jaxpose.evaluation import trajectory_error
 from jaxpose.fields import PoseNetConfig, numpy_evaluator, serialization
 from jaxpose.fields._entries import read_entries
@@ -261,6 +262,21 @@ def test_what_gives_no_poses_is_refused(tmp_path, kind, name, value, words):
     for read in (read_entries, serialization.load):
         with pytest.raises(DataError, match=f"field.npz: .*{words}"):
             read(tmp_path / "field.npz")
+
+
+@pytest.mark.parametrize("lasts", [0.0, 0.03, 0.5, 1.0, 1.04, 1.05, 3.0])
+def test_a_table_of_covariances_of_any_length_is_read_again(tmp_path, lasts):
+    """Of exactly one second there is a single move of one second, of less none."""
+    t, early = table_times((10.0, 10.0 + lasts))
+    P, moves = np.tile(np.eye(6), (len(t), 1, 1)), np.tile(2 * np.eye(6), (len(early), 1, 1))
+    field, params = fields.bspline((10.0, 10.0 + max(lasts, 0.1)), 4), jnp.zeros((7, 7))
+    file = tmp_path / "field.npz"
+    serialization.save(file, field, params, covariance=fields.Covariances(t, P, moves))
+    assert serialization.load(file)[0] == field
+    np.testing.assert_allclose(numpy_evaluator.load_covariance(file)(10.0 + lasts), P[:1])
+    if len(early):
+        later = numpy_evaluator.load_covariance(file, "relative_covariance")
+        np.testing.assert_allclose(later(10.0), moves[:1])
 
 
 def test_covariances_are_kept_and_interpolated(tmp_path):
