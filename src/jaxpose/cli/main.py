@@ -55,9 +55,13 @@ def main(args: Sequence[str] | None = None) -> None:
     elif name == "--version":
         say("jaxpose", f"jaxpose {jaxpose.__version__}")
     elif name in SUBCOMMANDS:
-        with ended_by_interrupt(f"jaxpose {name}"):
-            from jaxpose.experiments.command import start  # here, as --help and --version do without
-        start(SUBCOMMANDS[name].module, args[1:], prog=f"jaxpose {name}")
+        prog = f"jaxpose {name}"
+        try:
+            with ended_by_interrupt(prog):
+                from jaxpose.experiments.command import start  # here, as --help and --version do without
+            start(SUBCOMMANDS[name].module, args[1:], prog=prog)
+        except KeyboardInterrupt:
+            fail(prog, "interrupted")
     else:
         near = difflib.get_close_matches(name, SUBCOMMANDS, 1)
         hint = f"; did you mean {near[0]}?" if near else ""

@@ -54,10 +54,10 @@ def start(module: str, args: Sequence[str] | None = None, **given: Any) -> None:
     """
     prepare()
     name = given.get("prog", "jaxpose")
-    with ended_by_interrupt(name), progress.shown() as on_update:
-        on_update(Update("loading jaxpose", quiet=True))
-        main = importlib.import_module(module).main
     try:
+        with ended_by_interrupt(name), progress.shown() as on_update:
+            on_update(Update("loading jaxpose", quiet=True))
+            main = importlib.import_module(module).main
         main(args, **given)
     except KeyboardInterrupt:
         fail(name, "interrupted")
