@@ -368,7 +368,7 @@ def make_register(
             found.iterations,
             pose_sigma(found, problem.support),
             pose_covariance(found, problem.covariance),
-            found.information / found.evidence.dispersion,
+            image_information(found),
             correction,
         )
 
