@@ -23,8 +23,6 @@ from jaxpose.slam.tracking.predict import AHEAD, TrackingProblem
 
 _SETTLED = 2e-4  # [m, rad] a step this small ends the alignment
 _INDEPENDENT = 100.0  # pixels
-_UNSEEN = 1e-4  # share of a direction's own stiffness below which what its parts say is not compared
-_LEAST_DISPERSION = 0.01  # images of noise a tenth of what is expected
 _PARTS = 4  # of an image along each side, in which errors go together
 _LONGEST = 0.2  # [m, rad] no step is longer
 _FLAT = 0.05  # a distance that changes less along a metre says nothing about the surface
@@ -83,18 +81,11 @@ class Registration(NamedTuple):
 
     T_world_cam: Float[Array, "4 4"]
     information: Float[Array, "6 6"]  # Gauss-Newton's matrix over right increments
-    evidence: "Evidence"
+    by_parts: Float[Array, "6 6"]  # covariance that the image's errors make, by how its parts disagree
+    share: Float[Array, "6 6"]  # of the prediction's error in the pose
     loss: Float[Array, ""]
     residuals: Residuals
     iterations: Int[Array, ""]
-
-
-class Evidence(NamedTuple):
-    """What pulls a pose, and how far parts of the image agree on it."""
-
-    stiffness: Float[Array, "6 6"]  # derivative of what it is pulled by
-    pulls: Float[Array, "p 6"]  # of each part, scaled so that their squares add up to the sum's covariance
-    dispersion: Float[Array, ""]  # that covariance beside the one of independent pixels of unit variance
 
 
 class Slopes(NamedTuple):
@@ -193,7 +184,7 @@ def register(
 
     Residuals count by their size, within one sigma by their square: by squares throughout, a camera between
     furniture was lost. The predicted pose is a measurement too, with its covariance [m, rad]; against it the
-    image counts by how far its parts agree, since errors of a map go together.
+    image counts as `_INDEPENDENT` pixels, since errors of a map go together.
     """
     prior = jnp.linalg.inv(covariance)
     part = _parts(pixels)
@@ -203,16 +194,15 @@ def register(
         residual, slope, weight = _stacked(found, by, config)
         weighted = weight[:, None] * slope
         away = se3.log(se3.compose(se3.inverse(T_world_predicted), T))
-        evidence = _evidence(residual, slope, weight, part)
-        expected = evidence.dispersion * prior
+        expected = _weight(found) * prior
         information = jnp.matmul(weighted.T, slope, precision="highest")
         pull = jnp.matmul(expected, away, precision="highest")
         descent = jnp.matmul(residual, weighted, precision="highest") + pull
-        return information, expected, descent, evidence, found
+        return information, expected, descent, _errors(residual, slope, weight, part, expected), found
 
     def improve(carry):
         at, _ = carry
-        information, expected, descent, evidence, found = equations(at.T_world_cam)
+        information, expected, descent, errors, found = equations(at.T_world_cam)
         total = information + expected
         damped = total + _DAMPING * jnp.diag(jnp.diag(total)) + 1e-6 * jnp.eye(6)
         step = -jnp.linalg.solve(damped, descent)
@@ -220,7 +210,7 @@ def register(
         step = step * jnp.minimum(1, _LONGEST / jnp.maximum(length, 1e-12))
         T = se3.compose(at.T_world_cam, se3.exp(step))
         loss = image_loss(found, config)
-        return Registration(T, information, evidence, loss, found, at.iterations + 1), length
+        return Registration(T, information, *errors, loss, found, at.iterations + 1), length
 
     def unsettled(carry):
         at, length = carry
@@ -232,21 +222,21 @@ def register(
         jnp.zeros(count), jnp.zeros((count, 3)), jnp.zeros(count), zero, zero, jnp.ones(3), zero
     )
     unknown = jnp.zeros((6, 6))
-    unsaid = Evidence(unknown, jnp.zeros((_PARTS**2, 6)), zero)
-    start = Registration(T_world_cam, unknown, unsaid, zero, nothing, jnp.int32(0))
+    start = Registration(T_world_cam, unknown, unknown, unknown, jnp.zeros(()), nothing, jnp.int32(0))
     return jax.lax.while_loop(unsettled, improve, (start, jnp.inf))[0]
 
 
-def _evidence(
+def _errors(
     residual: Float[Array, " m"],
     slope: Float[Array, "m 6"],
     weight: Float[Array, " m"],
     part: Int[Array, " n"],
-) -> Evidence:
-    """The image's estimating equations, whose errors go together in unknown ways within its parts only.
+    expected: Float[Array, "6 6"],
+) -> tuple[Float[Array, "6 6"], Float[Array, "6 6"]]:
+    """The covariance that the image's errors make, and the share of the prediction's error in the pose.
 
-    What each part's residuals pull by is squared (Liang and Zeger 1986). Where too few parts are seen for
-    them to disagree, the image counts as `_INDEPENDENT` pixels.
+    Of estimating equations whose errors go together in unknown ways within parts of the image, and not beyond
+    (Liang and Zeger 1986): what each part's residuals pull by is squared.
     """
     count = part.shape[0]
     rows = (weight * residual)[:, None] * slope
@@ -254,16 +244,14 @@ def _evidence(
     in_part = jax.nn.one_hot(part, _PARTS**2, axis=0)
     pulls = jnp.matmul(in_part, of_pixels, precision="highest")
     seen = jnp.sum(jnp.any(pulls != 0, axis=1))
-    pulls = pulls * jnp.sqrt(seen / jnp.maximum(seen - 6, 1))  # the pose makes six of their sums nothing
+    free = seen / jnp.maximum(seen - 6, 1)  # six of the parts' sums are made nothing by the pose
     # Beyond one sigma a residual pulls by its sign alone: it does not hold the pose.
     holds = jnp.where(jnp.abs(residual) <= 1, weight, 0)[:, None] * slope
-    stiffness = jnp.matmul(holds.T, slope, precision="highest")
-    size = jnp.sqrt(jnp.diag(stiffness)) + 1e-6
-    balanced = stiffness / (size[:, None] * size[None]) + _UNSEEN * jnp.eye(6)
-    squares = (pulls / size[None]).T
-    dispersion = jnp.maximum(jnp.sum(squares * jnp.linalg.solve(balanced, squares)) / 6, _LEAST_DISPERSION)
-    many = jnp.maximum(jnp.sum(weight[:count] > 0).astype(weight.dtype), 1) / _INDEPENDENT
-    return Evidence(stiffness, pulls, jnp.where(seen > 6, dispersion, many))
+    stiffness = jnp.matmul(holds.T, slope, precision="highest") + expected
+    inverse = jnp.linalg.inv(stiffness + 1e-6 * jnp.eye(6))
+    moves = jnp.matmul(pulls, inverse, precision="highest")
+    share = jnp.matmul(inverse, expected, precision="highest")
+    return free * jnp.matmul(moves.T, moves, precision="highest"), share
 
 
 def _parts(pixels: Pixels) -> Int[Array, " n"]:
@@ -300,18 +288,18 @@ def line_delay_correction(
     A row that was read later than thought is moved by the camera's twist for that time.
 
     Returns:
-        Correction [s] and its information [1/s^2].
+        Correction [s] and its information [1/s^2], counted as `_INDEPENDENT` pixels.
     """
     at, by = surface_residuals(sample_map, found.T_world_cam, pixels, config)
     residual, slope, weight = _stacked(at, by, config)
     rows = jnp.concatenate([row, jnp.repeat(row, 3)])
     by_delay = jnp.matmul(slope, twist_cam, precision="highest") * rows
     weighted = weight[:, None] * slope
-    own = jnp.matmul(weighted.T, slope, precision="highest") + found.evidence.dispersion * prior
+    own = jnp.matmul(weighted.T, slope, precision="highest") + _weight(at) * prior
     shared = jnp.matmul(by_delay, weighted, precision="highest")
     information = jnp.sum(weight * by_delay**2) - shared @ jnp.linalg.solve(own, shared)
     correction = -jnp.sum(weight * by_delay * residual) / jnp.maximum(information, 1e-12)
-    return jnp.stack([correction, information / found.evidence.dispersion])
+    return jnp.stack([correction, information / _weight(at)])
 
 
 def pose_sigma(found: Registration, support: Float[Array, "6 6"]) -> Float[Array, "2"]:
@@ -321,20 +309,20 @@ def pose_sigma(found: Registration, support: Float[Array, "6 6"]) -> Float[Array
     return jnp.stack([worst(covariance[:3, :3]), worst(covariance[3:, 3:])])
 
 
-def pose_covariance(found: Registration, predicted: Float[Array, "6 6"]) -> Float[Array, "6 6"]:
-    """Covariance of a registered pose beside the map, by that of the prediction; right increments."""
-    image = found.evidence
-    expected = image.dispersion * jnp.linalg.inv(predicted)
-    inverse = jnp.linalg.inv(image.stiffness + expected + 1e-6 * jnp.eye(6))
-    moves = jnp.matmul(image.pulls, inverse, precision="highest")
-    share = jnp.matmul(inverse, expected, precision="highest")
-    carried = jnp.einsum("ij,jk,lk->il", share, predicted, share, precision="highest")
-    return jnp.matmul(moves.T, moves, precision="highest") + carried
+def pose_covariance(found: Registration, problem: TrackingProblem) -> Float[Array, "6 6"]:
+    """Covariance of a registered pose beside the map, over right increments of the camera."""
+    share = found.share
+    return found.by_parts + jnp.einsum("ij,jk,lk->il", share, problem.covariance, share, precision="highest")
 
 
 def image_information(found: Registration) -> Float[Array, "6 6"]:
     """What an image says of its pose, counted as `_INDEPENDENT` pixels."""
-    return found.information * (_INDEPENDENT / jnp.maximum(jnp.sum(found.residuals.inlier), 1))
+    return found.information / _weight(found.residuals)
+
+
+def _weight(found: Residuals) -> Float[Array, ""]:
+    """How many times its own worth a pixel would count if none went together with another."""
+    return jnp.maximum(jnp.sum(found.inlier), 1) / _INDEPENDENT
 
 
 def make_register(
@@ -367,7 +355,7 @@ def make_register(
             residuals.valid,
             found.iterations,
             pose_sigma(found, problem.support),
-            pose_covariance(found, problem.covariance),
+            pose_covariance(found, problem),
             image_information(found),
             correction,
         )
