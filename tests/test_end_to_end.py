@@ -23,7 +23,7 @@ from jaxpose.files.trajectories import read_tum
 
 ROWS = all_formats()
 T = room_layouts.WALK.T_world_cam
-NS = [k * 10**8 for k in range(rooms.COUNT)]  # on a run's clock
+NS = [room_layouts.T0_NS + k * 10**8 for k in range(rooms.COUNT)]  # on the recording's clock, and its run's
 SLAM = ("--no-loops", "--refine", "none", "--smoke")  # what is left out compiles for long
 
 
@@ -262,7 +262,7 @@ def of_rerun(file):
 
 
 def of_field(file):
-    return numpy_evaluator.load(file)(rooms.STEP_S * np.arange(rooms.COUNT))
+    return numpy_evaluator.load(file)(np.array(NS) / 1e9)
 
 
 def copied(form, folder, track):

@@ -60,7 +60,7 @@ def _recording(path: Path, form: rgbd_registry.Format) -> Source:
     notes = (f"{missing} frames without a true pose",) if missing else ()
     file = TrajectoryFile(trajectory, "TUM", stamped, notes, 0, missing, len(recording.t))
     names = tuple(np.array(recording.files)[known].tolist()) if recording.files else ()
-    return Source(path, f"{form} recording", trajectory, stamped, file, is_recording=True, names=names)
+    return Source(path, f"{form} recording", trajectory, stamped, file, names=names)
 
 
 def _of_images(path: Path, what: str, names: Sequence[str], T: Float[np.ndarray, "n 4 4"]) -> Source:

@@ -128,8 +128,6 @@ def run(config: Config, on_update: OnUpdate = silent) -> Result:
     on_update(Update(f"reading {config.estimate} and {config.reference}", quiet=True))
     estimate = read_source(config.estimate, config.columns)
     reference = read_source(config.reference, config.reference_columns)
-    if estimate.is_run and reference.is_recording:  # a run's clock begins with its recording
-        reference = reference._replace(trajectory=reference.trajectory._replace(t0_ns=0))
     pairs = _pair(config, estimate, reference)
     ate = trajectory_error.ate(pairs.estimate, pairs.reference, config.align)
     aligned = trajectory_error.align(ate.alignment, pairs.estimate)

@@ -25,7 +25,6 @@ class Source(NamedTuple):
     trajectory: trajectories.Trajectory
     stamped: bool  # False: the pose of line i is said to be at i seconds
     file: trajectories.TrajectoryFile | None = None  # None: a run
-    is_recording: bool = False  # whose true poses these are
     names: tuple[str, ...] = ()  # of the image of each pose, where they are known
 
     @property
