@@ -80,39 +80,38 @@ def kinematics(segment: Segment, weights: Float[Array, "3 3"]) -> Kinematics:
     Returns:
         The motion with its Jacobians.
     """
-    dtype = segment.start.dtype
-    identity, nothing = jnp.eye(6, dtype=dtype), jnp.zeros((4, 6, 6), dtype)
+    identity = jnp.eye(6, dtype=segment.start.dtype)
+    step = weights[0, :, None] * segment.increment
+    moved = se3.exp(step)
+    back = se3.adjoint(se3.inverse(moved))
+    turned = weights[0, :, None, None] * jax.vmap(right_jacobian)(step)
+    own = weights[1, :, None] * segment.increment
+    bracket = jax.vmap(ad)(own)
+    T, twist, rate = segment.start, 0 * own[0], 0 * own[0]
+    # Derivatives by the start (of the pose alone), then by each increment so far.
+    by_pose, by_twist, by_rate = identity, identity[:, :0], identity[:, :0]
+    for j, (_, speed, change) in enumerate(weights.T):
+        carried_twist, carried_rate = back[j] @ twist, back[j] @ rate
+        twist = carried_twist + own[j]
+        rate = carried_rate - bracket[j] @ twist + change * segment.increment[j]
+        own_twist = ad(carried_twist) @ turned[j] + speed * identity
+        own_rate = ad(carried_rate) @ turned[j] + speed * ad(twist) + change * identity
+        by_pose = jnp.concatenate([back[j] @ by_pose, turned[j]], axis=1)
+        by_twist = jnp.concatenate([back[j] @ by_twist, own_twist], axis=1)
+        by_rate = jnp.concatenate([back[j] @ by_rate, own_rate], axis=1) - bracket[j] @ by_twist
+        T = se3.compose(T, moved[j])
+    by_increment = jnp.concatenate([by_pose[:, 6:], by_twist, by_rate])
+    by_control = _by_control_poses(by_increment, segment)
+    return Kinematics(
+        T, twist, rate, by_control[:6].at[:, :6].add(by_pose[:, :6]), *by_control[6:].reshape(2, 6, 24)
+    )
 
-    def increment(so_far, of_one):
-        T, twist, rate, by_pose, by_twist, by_rate = so_far
-        x, (step, speed, change), own = of_one
-        moved = se3.exp(step * x)
-        back = se3.adjoint(se3.inverse(moved))
-        turned = step * right_jacobian(step * x)
-        carried_twist, carried_rate = back @ twist, back @ rate
-        twist = carried_twist + speed * x
-        bracket = speed * ad(x)
-        rate = carried_rate - bracket @ twist + change * x
-        by_pose = back @ by_pose + own * turned[None]
-        own_twist = ad(carried_twist) @ turned + speed * identity
-        by_twist = back @ by_twist + own * own_twist[None]
-        own_rate = ad(carried_rate) @ turned + speed * ad(twist) + change * identity
-        by_rate = back @ by_rate + own * own_rate[None] - bracket @ by_twist
-        return (se3.compose(T, moved), twist, rate, by_pose, by_twist, by_rate), None
 
-    # derivatives by the start, then by each increment
-    start = (segment.start, jnp.zeros(6, dtype), jnp.zeros(6, dtype))
-    start += (nothing.at[0].set(identity), nothing, nothing)
-    each = (segment.increment, weights.T, jnp.eye(4, dtype=dtype)[1:, :, None, None])
-    (T, twist, rate, *derivatives), _ = jax.lax.scan(increment, start, each)
-    return Kinematics(T, twist, rate, *(_by_control_poses(d, segment) for d in derivatives))
-
-
-def _by_control_poses(d: Float[Array, "4 6 6"], segment: Segment) -> Float[Array, "6 24"]:
-    """Derivatives by the four control poses from those by the start and by the three increments."""
-    by = [d[0] + d[1] @ segment.by_previous[0]]
-    by += [d[j] @ segment.by_next[j - 1] + d[j + 1] @ segment.by_previous[j] for j in (1, 2)]
-    return jnp.concatenate([*by, d[3] @ segment.by_next[2]], axis=1)
+def _by_control_poses(d: Float[Array, "n 18"], segment: Segment) -> Float[Array, "n 24"]:
+    """Derivatives by the four control poses from those by the three increments between them."""
+    pairs = jnp.concatenate([segment.by_previous, segment.by_next], axis=2)
+    x, y, z = (d[:, 6 * j : 6 * j + 6] @ pairs[j] for j in range(3))
+    return jnp.concatenate([x[:, :6], x[:, 6:] + y[:, :6], y[:, 6:] + z[:, :6], z[:, 6:]], axis=1)
 
 
 def ad(x: Float[Array, "6"]) -> Float[Array, "6 6"]:
@@ -132,12 +131,20 @@ def ad(x: Float[Array, "6"]) -> Float[Array, "6 6"]:
 def right_jacobian(x: Float[Array, "6"]) -> Float[Array, "6 6"]:
     """How an exponential moves on its right: `exp(x + d) = exp(x) exp(J d)` for small d.
 
+    Of a rotation's vector it is what a transform's translation is multiplied by, transposed; a twist is that
+    vector with a dual part, so that the block beside it is a derivative along the translation.
+
     Args:
         x: a twist.
 
     Returns:
-        J, by forward mode through `se3.exp`, whose series at 0 it inherits.
+        J.
     """
-    T, dT = se3.exp(x), jax.jacfwd(se3.exp)(x)
-    own = jnp.einsum("ji,jkd->ikd", T[:3, :3], dT[:3], precision="highest")
-    return jnp.concatenate([own[:, 3], jnp.stack([own[2, 1], own[0, 2], own[1, 0]])])
+    unit = jnp.eye(3, dtype=x.dtype)
+
+    def of_rotation(phi):
+        return se3.exp(jnp.concatenate([unit, jnp.broadcast_to(phi, (3, 3))], axis=1))[:, :3, 3]
+
+    turn, beside = jax.jvp(of_rotation, (x[3:],), (x[:3],))
+    upper = jnp.concatenate([turn, beside], axis=1)
+    return jnp.concatenate([upper, jnp.concatenate([jnp.zeros_like(turn), turn], axis=1)])

@@ -144,13 +144,16 @@ def _guess(measured: _Measured, T_body_cam, gravity_world, offset_s: float) -> _
     gravity = np.array(GRAVITY_WORLD if gravity_world is None else gravity_world, np.float64)
     if imu is None:
         return _Guess(np.eye(4) if T_body_cam is None else T_body_cam, gravity, 0.0, 1.0)
+    unknown_gravity = gravity_world is None and "gravity" in asked
+    if T_body_cam is not None and not (unknown_gravity or {"offset", "scale"} & set(asked)):
+        return _Guess(np.asarray(T_body_cam, np.float64), gravity, offset_s, 1.0)
     R = None if T_body_cam is None else np.asarray(T_body_cam, np.float64)[:3, :3]
     turned = alignment.gyro_orientation(imu)
     if R is None or "offset" in asked:
         reach = _REACH_S if "offset" in asked else 0.0
         shift, R = alignment.rotation_alignment(t + offset_s, T[:, :3, :3], turned, reach, R)
         offset_s += shift
-    scale, unknown_gravity = 1.0, gravity_world is None and "gravity" in asked
+    scale = 1.0
     if "scale" in asked or unknown_gravity:
         size, known = float(np.linalg.norm(gravity)), None if "scale" in asked else 1.0
         scale, found = alignment.scale_and_gravity(t + offset_s, T, imu, turned, R, size, scale=known)

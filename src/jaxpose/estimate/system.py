@@ -258,15 +258,16 @@ def camera_rows(
 
 def normal_equations(problem: Problem, state: State, found: Residuals) -> tuple[Blocks, Float[Array, ""]]:
     """What Gauss-Newton solves, and half the sum of squares."""
-    pairs = state.bias.shape[0] - 1
-    H = jnp.zeros((pairs, _PAIR + BORDER, _PAIR + BORDER), state.control.dtype)
-    side = jnp.zeros(H.shape[:2], H.dtype)
-    for rows in (found.inertial, found.motion, found.walk, found.drift):
-        J, r = rows.jacobian.reshape(pairs, -1, H.shape[1]), rows.residual.reshape(pairs, -1)
-        H, side = H + jnp.swapaxes(J, 1, 2) @ J, side - jnp.einsum("nri,nr->ni", J, r)
-    J, r = found.poses.jacobian, found.poses.residual
-    H = H + jax.ops.segment_sum(jnp.swapaxes(J, 1, 2) @ J, found.pair, pairs)
-    side = side - jax.ops.segment_sum(jnp.einsum("pri,pr->pi", J, r), found.pair, pairs)
+    pairs, size = state.bias.shape[0] - 1, _PAIR + BORDER
+    each = [
+        jnp.concatenate([rows.jacobian, rows.residual[..., None]], axis=-1).reshape(pairs, -1, size + 1)
+        for rows in (found.inertial, found.motion, found.walk, found.drift)
+    ]
+    J = jnp.concatenate(each, axis=1)  # with the residuals as its last column
+    of_poses = jnp.concatenate([found.poses.jacobian, found.poses.residual[..., None]], axis=-1)
+    gram = jnp.swapaxes(J, 1, 2) @ J
+    total = gram + jax.ops.segment_sum(jnp.swapaxes(of_poses, 1, 2) @ of_poses, found.pair, pairs)
+    H, side = total[:, :size, :size], -total[:, :size, size]
 
     joined = lambda a, b: jnp.concatenate([a, 0 * a[:1]]) + jnp.concatenate([0 * b[:1], b])
     diagonal = joined(H[:, :BLOCK, :BLOCK], H[:, BLOCK:_PAIR, BLOCK:_PAIR])
@@ -283,7 +284,7 @@ def normal_equations(problem: Problem, state: State, found: Residuals) -> tuple[
     corner += jnp.diag(jnp.where(prior.free, corner_information, 1))
     corner_side -= jnp.where(prior.free, corner_information * away, 0)
     blocks = Blocks(diagonal, H[:, BLOCK:_PAIR, :BLOCK], border, corner, row, corner_side)
-    cost = sum(jnp.sum(rows.residual**2) for rows in (found.inertial, found.motion, found.walk, found.drift))
+    cost = jnp.sum(gram[:, size, size])
     pose_square = jnp.sum(found.poses.residual**2, axis=-1)  # already times the weight
     far = pose_square**2 / HUBER  # the unweighted square where it is beyond
     cost += jnp.sum(jnp.where(far > HUBER, 2 * jnp.sqrt(HUBER * far) - HUBER, pose_square))
