@@ -52,6 +52,19 @@ def fail(name: str, message: str) -> NoReturn:
 
 
 @contextmanager
+def interruptible(name: str) -> Iterator[None]:
+    """Ctrl-C ends what it holds with one line on stderr and code 1.
+
+    Args:
+        name: what that line begins with.
+    """
+    try:
+        yield
+    except KeyboardInterrupt:
+        fail(name, "interrupted")
+
+
+@contextmanager
 def ended_by_interrupt(name: str) -> Iterator[None]:
     """Let Ctrl-C end the process at once, with one line on stderr and code 1, while nothing is to be kept.
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import jaxpose
-from jaxpose._terminal import ended_by_interrupt, fail, prepare, say
+from jaxpose._terminal import ended_by_interrupt, fail, interruptible, prepare, say
 
 
 class _Subcommand(NamedTuple):
@@ -56,12 +56,10 @@ def main(args: Sequence[str] | None = None) -> None:
         say("jaxpose", f"jaxpose {jaxpose.__version__}")
     elif name in SUBCOMMANDS:
         prog = f"jaxpose {name}"
-        try:
+        with interruptible(prog):
             with ended_by_interrupt(prog):
                 from jaxpose.experiments.command import start  # here, as --help and --version do without
             start(SUBCOMMANDS[name].module, args[1:], prog=prog)
-        except KeyboardInterrupt:
-            fail(prog, "interrupted")
     else:
         near = difflib.get_close_matches(name, SUBCOMMANDS, 1)
         hint = f"; did you mean {near[0]}?" if near else ""

@@ -123,9 +123,7 @@ def ad(x: Float[Array, "6"]) -> Float[Array, "6 6"]:
     Returns:
         The derivative of `adjoint(exp(s x))` by s at 0 (Sola et al. 2018, table 1).
     """
-    turn, shift = se3.hat(x[3:]), se3.hat(x[:3])
-    upper = jnp.concatenate([turn, shift], axis=1)
-    return jnp.concatenate([upper, jnp.concatenate([jnp.zeros_like(turn), turn], axis=1)])
+    return _of_twists(se3.hat(x[3:]), se3.hat(x[:3]))
 
 
 def right_jacobian(x: Float[Array, "6"]) -> Float[Array, "6 6"]:
@@ -145,6 +143,10 @@ def right_jacobian(x: Float[Array, "6"]) -> Float[Array, "6 6"]:
     def of_rotation(phi):
         return se3.exp(jnp.concatenate([unit, jnp.broadcast_to(phi, (3, 3))], axis=1))[:, :3, 3]
 
-    turn, beside = jax.jvp(of_rotation, (x[3:],), (x[:3],))
+    return _of_twists(*jax.jvp(of_rotation, (x[3:],), (x[:3],)))
+
+
+def _of_twists(turn: Float[Array, "3 3"], beside: Float[Array, "3 3"]) -> Float[Array, "6 6"]:
+    """What does `turn` to both halves of a twist, and adds `beside` of its rotation to its translation."""
     upper = jnp.concatenate([turn, beside], axis=1)
     return jnp.concatenate([upper, jnp.concatenate([jnp.zeros_like(turn), turn], axis=1)])

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import platformdirs
 import tyro
 
-from jaxpose._terminal import ended_by_interrupt, fail, prepare, say
+from jaxpose._terminal import ended_by_interrupt, fail, interruptible, prepare, say
 from jaxpose.errors import DataError
 from jaxpose.experiments import progress
 from jaxpose.experiments.option_help import Groups, help_text
@@ -54,13 +54,11 @@ def start(module: str, args: Sequence[str] | None = None, **given: Any) -> None:
     """
     prepare()
     name = given.get("prog", "jaxpose")
-    try:
+    with interruptible(name):
         with ended_by_interrupt(name), progress.shown() as on_update:
             on_update(Update("loading jaxpose", quiet=True))
             main = importlib.import_module(module).main
         main(args, **given)
-    except KeyboardInterrupt:
-        fail(name, "interrupted")
 
 
 def execute(command: Command, args: Sequence[str] | None = None) -> Any:
@@ -137,12 +135,10 @@ def guarded(name: str, action: Callable[[OnUpdate], Any]) -> Any:
     """
     _keep_compiled()
     try:
-        with progress.shown() as on_update:
+        with interruptible(name), progress.shown() as on_update:
             return action(on_update)
     except (DataError, OSError) as error:
         fail(name, str(error))
-    except KeyboardInterrupt:
-        fail(name, "interrupted")
 
 
 def _keep_compiled() -> None:
