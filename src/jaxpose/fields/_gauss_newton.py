@@ -1,8 +1,8 @@
 """Gauss-Newton for a B-spline along stamped poses, in float64 numpy: there is nothing to compile."""
 
 import numpy as np
-from jaxtyping import Float
-from scipy.sparse import csr_array, eye_array
+from jaxtyping import Float, Int
+from scipy.sparse import csc_array, eye_array
 from scipy.sparse.linalg import splu
 
 from jaxpose.fields import numpy_evaluator
@@ -10,7 +10,7 @@ from jaxpose.fields._bspline import Bspline
 
 DELTA = 1e-2  # [rad or length scales] smaller residuals count by their square, larger by their size
 _STEPS = 20  # at most
-_SETTLED, _NOTHING = 1e-6, 1e-12  # share of the loss that a step takes off, and loss, at which it is done
+_SETTLED, _NOTHING = 1e-5, 1e-12  # share of the loss that a step takes off, and loss, at which it is done
 _DAMPING = 1e-9  # of the largest entry of the normal equations
 _DIFFERENCE = 1e-6  # of control points, for derivatives
 _RESIDUALS, _UNKNOWNS = 12, 28  # of a pose: its 3 x 4 numbers, and the four control points that it depends on
@@ -29,6 +29,8 @@ def fit_spline(
     weighted anew in each step.
     """
 
+    row = _first_points(spline, t)
+
     def residuals(points):
         factor = {"kind": "bspline", "span": np.array(spline.span), "control_points": points}
         error = numpy_evaluator.evaluate(factor, t) - T
@@ -38,9 +40,8 @@ def fit_spline(
     r, damping = residuals(points), _DAMPING
     value, weights = _loss(r)
     for _ in range(_STEPS):
-        J = _jacobian(spline, residuals, points, r, t)
-        weighted = J.T * weights.ravel()
-        normal, side = (weighted @ J).tocsc(), weighted @ r.ravel()
+        J = _jacobian(residuals, points, r, row)
+        normal, side = _normal_equations(J, r, weights, row, points.size)
         while True:
             damped = normal + damping * normal.diagonal().max() * eye_array(points.size, format="csc")
             moved = points - splu(damped).solve(side).reshape(-1, 7)
@@ -66,18 +67,34 @@ def _loss(r: Float[np.ndarray, "n 12"]) -> tuple[float, Float[np.ndarray, "n 12"
     return float(np.mean(square * weights / (1 + weights))), np.repeat(weights, [3, 9], axis=1)
 
 
-def _jacobian(spline: Bspline, residuals, points, r, t) -> csr_array:
-    """Derivatives by differences; every fourth control point is moved at once, as a pose depends on four."""
+def _first_points(spline: Bspline, t) -> Int[np.ndarray, " n"]:
+    """The first of the four control points that the pose at each time depends on."""
     first, last = spline.span
     place = (t - first) * (spline.intervals / (last - first))
-    row = np.clip(np.floor(place), 0, spline.intervals - 1).astype(int)  # the first point of each pose's four
-    values = np.zeros((len(t), _RESIDUALS, _UNKNOWNS))
+    return np.clip(np.floor(place), 0, spline.intervals - 1).astype(int)
+
+
+def _jacobian(residuals, points, r, row) -> Float[np.ndarray, "n 12 28"]:
+    """Derivatives by differences; every fourth control point is moved at once, as a pose depends on four."""
+    J = np.empty((len(row), _RESIDUALS, _UNKNOWNS))
     for a in range(4):
         which = (a - row) % 4  # of a pose's four is moved with points a, a + 4, a + 8, ...
         for k in range(7):
             changed = points.copy()
             changed[a::4, k] += _DIFFERENCE
-            values[np.arange(len(t)), :, 7 * which + k] = (residuals(changed) - r) / _DIFFERENCE
-    columns = np.repeat(7 * row[:, None] + np.arange(_UNKNOWNS), _RESIDUALS, axis=0)
-    starts = np.arange(0, columns.size + 1, _UNKNOWNS)
-    return csr_array((values.ravel(), columns.ravel(), starts), shape=(r.size, points.size))
+            J[np.arange(len(row)), :, 7 * which + k] = (residuals(changed) - r) / _DIFFERENCE
+    return J
+
+
+def _normal_equations(J, r, weights, row, size: int) -> tuple[csc_array, Float[np.ndarray, " k"]]:
+    """The normal equations of the points; poses of one interval share theirs."""
+    intervals, begins = np.unique(row, return_index=True)
+    blocks, side = np.empty((len(intervals), _UNKNOWNS, _UNKNOWNS)), np.zeros(size)
+    unknowns = 7 * intervals[:, None] + np.arange(_UNKNOWNS)
+    for k, (first, last) in enumerate(zip(begins, [*begins[1:], len(row)], strict=True)):
+        A = J[first:last].reshape(-1, _UNKNOWNS)
+        weighted = weights[first:last].reshape(-1, 1) * A
+        blocks[k] = A.T @ weighted
+        side[unknowns[k]] += weighted.T @ r[first:last].ravel()
+    places = np.broadcast_arrays(unknowns[:, :, None], unknowns[:, None, :])
+    return csc_array((blocks.ravel(), [place.ravel() for place in places]), (size, size)), side

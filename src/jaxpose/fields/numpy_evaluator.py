@@ -103,9 +103,9 @@ def _bspline(p, t):
     control = _transform(points[:, 3:] + [1, 0, 0, 0], points[:, :3])
     place = (t - first) * ((len(points) - 3) / (last - first))
     row = np.clip(np.floor(place), 0, len(points) - 4).astype(int)
-    s, T = place - row, control[row]
+    s, T, (used, at) = place - row, control[row], np.unique(row, return_inverse=True)
     for k, weight in enumerate((5 + s * (3 + s * (s - 3)), 1 + s * (3 + s * (3 - 2 * s)), s**3)):
-        T = T @ _exp(weight[:, None] / 6 * _log(np.linalg.inv(control[row + k]) @ control[row + k + 1]))
+        T = T @ _exp(weight[:, None] / 6 * _log(np.linalg.inv(control[used + k]) @ control[used + k + 1])[at])
     return T
 
 
