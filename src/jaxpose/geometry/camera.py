@@ -109,22 +109,22 @@ def unproject(camera: Camera, pixel: Float[Array, "*n 2"]) -> Float[Array, "*n 3
     return _unproject(jnp, camera, pixel)
 
 
-def pixel_slopes(camera: Camera, direction_cam: Float[Array, "*n 3"]) -> Float[Array, "*n 2 2"]:
+def pixel_slopes(camera: Camera, direction_cam: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 2 2"]:
     """How a pixel moves with its ray: derivatives of (u, v) by x and y at z = 1, where `project` sees it.
 
     Args:
-        camera: The camera; its intrinsics may be traced.
+        camera: The camera.
         direction_cam: Directions (x, y, 1), as `unproject` gives them.
 
     Returns:
         Rows u and v, columns x and y [px].
     """
-    xx = yy = jnp.ones_like(direction_cam[..., 0])
-    xy = jnp.zeros_like(xx)
+    xx = yy = np.ones_like(direction_cam[..., 0])
+    xy = np.zeros_like(xx)
     if camera.distortion:
-        _, (xx, xy, yy) = _distort(jnp, camera.distortion, direction_cam[..., :2])
+        _, (xx, xy, yy) = _distort(np, camera.distortion, direction_cam[..., :2])
     rows = [camera.fx * xx, camera.fx * xy, camera.fy * xy, camera.fy * yy]
-    return jnp.stack(rows, axis=-1).reshape(*xx.shape, 2, 2)
+    return np.stack(rows, axis=-1).reshape(*xx.shape, 2, 2)
 
 
 def project_numpy(camera: Camera, point_cam: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 2"]:

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxpose.geometry import se3
-from jaxpose.geometry.camera import Camera, pixel_grid, pixel_slopes, unproject, unproject_numpy
+from jaxpose.geometry.camera import Camera, pixel_grid, pixel_slopes, unproject_numpy
 from jaxpose.scenes.types import Params
 from jaxpose.scenes.voxel_blocks import (
     CELLS,
@@ -191,7 +191,7 @@ def in_view_test(camera: Camera) -> Callable[[Float[Array, "m 8 3"], Float[Array
 def seen_by(image: Image, camera: Camera) -> Callable[[Located], SurfaceObservation]:
     """What an image says at located points, ready to be asked: one row is read for each."""
     planes = tangent_planes(image.depth, camera)
-    cosine = _cosine(planes[..., :3], _directions(camera))
+    cosine = _cosine(planes[..., :3], jnp.asarray(_rays(camera)))
     near = (depth_sigma(jnp.ones(())) / depth_sigma(image.depth)) ** 2
     weight = jnp.where(image.depth > 0, near * jnp.maximum(cosine, GRAZING), 0)
     rgb = image.rgb.astype(planes.dtype) / 255 * image.exposure[None, None]
@@ -214,13 +214,13 @@ def tangent_planes(depth: Float[Array, "h w"], camera: Camera) -> Float[Array, "
     there, so that no slope is taken across an edge. Where there is no such pair, or the surface is seen at a
     grazing angle, the plane is the one across the optical axis, n = (0, 0, -1).
     """
-    direction = _directions(camera)
+    rays = _rays(camera)
+    direction, slopes = jnp.asarray(rays), jnp.asarray(pixel_slopes(camera, rays))
     seen = depth > 0
     inverse = jnp.where(seen, 1 / jnp.where(seen, depth, 1), 0)
     near = _SAME_SURFACE * depth_sigma(depth) * inverse**2
     by_x, known_x = _slope(inverse, near, axis=1)
     by_y, known_y = _slope(inverse, near, axis=0)
-    slopes = pixel_slopes(camera, direction)
     x, y = (by_x * slopes[..., 0, k] + by_y * slopes[..., 1, k] for k in range(2))
     along = -jnp.stack([x, y, inverse - x * direction[..., 0] - y * direction[..., 1]], axis=-1)
     normal = along / jnp.maximum(jnp.linalg.norm(along, axis=-1, keepdims=True), 1e-9)
@@ -230,9 +230,9 @@ def tangent_planes(depth: Float[Array, "h w"], camera: Camera) -> Float[Array, "
     return jnp.concatenate([normal, -jnp.sum(normal * point, axis=-1, keepdims=True)], axis=-1)
 
 
-def _directions(camera: Camera) -> Float[Array, "h w 3"]:
-    """The rays of all pixels in camera axes (z = 1)."""
-    return unproject(camera, jnp.asarray(pixel_grid(camera), jnp.float32))
+def _rays(camera: Camera) -> Float[np.ndarray, "h w 3"]:
+    """The rays of all pixels in camera axes (z = 1); a compiler takes seconds to undo their distortion."""
+    return unproject_numpy(camera, pixel_grid(camera)).astype(np.float32)
 
 
 def _cosine(normal: Float[Array, "h w 3"], direction: Float[Array, "h w 3"]) -> Float[Array, "h w"]:

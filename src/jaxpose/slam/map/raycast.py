@@ -14,8 +14,11 @@ from jaxpose.slam.config import SampleConfig
 from jaxpose.slam.observation import Pixels, render_pixels
 
 _CHUNK = 4800  # rays rendered in one call
-_TOGETHER = 8  # samples of a ray that are looked at in one go
 _NEAREST = 0.02  # [m]
+_FREE, _STRIDE = (
+    0.99,
+    0.9,
+)  # truncations: a distance from which on no surface is near, and how far one goes there
 _BACKGROUND = 0.86  # grey where there is no surface
 
 
@@ -39,7 +42,7 @@ def viewer(scene: SceneField, truncation: float, camera: Camera) -> Viewer:
     """The view of a scene of signed distance that is cut off at `truncation` [m].
 
     Compiled once, whatever the pixels and however far the scene reaches. Rays march by a third of the
-    truncation until all have gone behind a surface or left the scene.
+    truncation, faster where no surface is near, until all have gone behind a surface or left the scene.
     """
     fine = SampleConfig(band=truncation / 2, width=truncation / 24)
     step = truncation / 3
@@ -56,26 +59,20 @@ def viewer(scene: SceneField, truncation: float, camera: Camera) -> Viewer:
         leaves = jnp.min(jnp.max(sides, axis=0), axis=-1)
 
         def march(carry):
-            i, surface, before = carry
-            depth = _NEAREST + step * (i + jnp.arange(_TOGETHER)).astype(jnp.float32)
-            points = origin[None, None] + depth[None, :, None] * along[:, None]
-            distance, _ = jax.vmap(jax.vmap(query, in_axes=(0, None)))(points, along)
-            values = jnp.concatenate([before[:, None], distance], axis=1)
-            enters = (values[:, :-1] > 0) & (values[:, 1:] <= 0)
-            k = jnp.argmax(enters, axis=1)
-            here = jnp.take_along_axis(enters, k[:, None], 1)[:, 0]
-            front, behind = (jnp.take_along_axis(values, k[:, None] + n, 1)[:, 0] for n in (0, 1))
-            share = front / jnp.where(here, front - behind, 1)
-            found = _NEAREST + step * ((i + k - 1).astype(jnp.float32) + share)
-            surface = jnp.where((surface == 0) & here, found, surface)
-            return i + _TOGETHER, surface, distance[:, -1]
+            depth, distance, surface = carry
+            ahead = depth + jnp.where(distance > _FREE * truncation, _STRIDE * truncation, step)
+            points = origin[None] + ahead[:, None] * along
+            found, _ = jax.vmap(query)(points, along)
+            enters = (surface == 0) & (distance > 0) & (found <= 0)
+            share = distance / jnp.where(enters, distance - found, 1)
+            return ahead, found, jnp.where(enters, depth + share * (ahead - depth), surface)
 
         def goes_on(carry):
-            i, surface, _ = carry
-            return jnp.any((surface == 0) & (_NEAREST + step * i.astype(jnp.float32) < leaves))
+            depth, _, surface = carry
+            return jnp.any((surface == 0) & (depth < leaves))
 
         zero = jnp.zeros(direction.shape[0])
-        _, surface, _ = jax.lax.while_loop(goes_on, march, (jnp.int32(0), zero, zero))
+        *_, surface = jax.lax.while_loop(goes_on, march, (zero + _NEAREST, zero, zero))
         pixels = Pixels(direction, surface, jnp.zeros_like(direction))
         seen = render_pixels(query, T_world_cam, pixels, jnp.float32(1.0), fine)
         there = (surface > 0) & (seen.opacity > 0.5)
