@@ -29,6 +29,7 @@ from jaxpose.fields.types import Span
 from jaxpose.geometry import rigid
 
 _TABLE_HZ = 20.0  # of covariances in files
+_TOGETHER = 256  # times that are asked in one call, so that one shape is compiled
 _UNOBSERVED = 0.1  # share of what was known before
 
 
@@ -158,9 +159,10 @@ class Posterior(NamedTuple):
         first, last = self.span
         if t.ndim != 1 or not ((t >= first - 1e-9) & (t <= last + 1e-9)).all():
             raise ValueError(f"t: expected times (n,) [s] between {first:.6g} and {last:.6g}, got {t}")
+        padded = np.resize(t, (max(-(-len(t) // _TOGETHER), 1), _TOGETHER))
         with jax.enable_x64(True):
-            rows = _camera_rows(self.problem, self.state, jnp.asarray(t - self.clock_s))
-        return tuple(np.asarray(x) for x in rows)
+            rows = [_camera_rows(self.problem, self.state, jnp.asarray(x - self.clock_s)) for x in padded]
+        return tuple(np.concatenate(x)[: len(t)] for x in zip(*rows, strict=True))
 
 
 def table_times(span: Span) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " k"]]:
