@@ -151,7 +151,7 @@ def test_a_study_puts_runs_side_by_side(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_sigkill_in_the_middle_changes_no_number(tmp_path):
-    whole, killed = whole_and_killed("event_nerf", "--image-width 16 --events 64", 1000, tmp_path)
+    whole, killed = whole_and_killed("event_nerf", "--image-width 16 --events 64", 400, tmp_path)
     for key in ("rotation_error_deg", "translation_error", "psnr", "ssim"):
         assert killed[key] == whole[key]
 

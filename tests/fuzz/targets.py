@@ -406,7 +406,8 @@ TARGETS = {
     ),
     "registration": Target(
         lambda folder: registration.save(
-            folder / "r.npz", registration.Registered(_poses(), np.ones(COUNT, bool), *_BOX, 0.5, 9.0, 7, 0.3)
+            folder / "r.npz",
+            registration.Registered(_poses(), np.ones(COUNT, bool), *_BOX, 0.5, 9.0, 7, 0.3, True),
         ),
         _of("r.npz", lambda file: registration.load(file, COUNT)._replace(far=1.0)),  # may be infinite
     ),

@@ -42,6 +42,7 @@ class Bundle(NamedTuple):
     points: Float[np.ndarray, "m 3"]  # those seen by supported photographs
     depth: Float[np.ndarray, " k"]  # of every observation that agrees, along the optical axis
     noise_px: float  # sigma of the reprojection errors that agree
+    start_agrees: float  # share of the observations that agree, which do with the poses it started from too
 
 
 class _Problem(NamedTuple):
@@ -111,7 +112,9 @@ def adjust(
     agree &= supported[problem.view]
     seen = np.unique(problem.point[agree])
     place = to_start.apply(points[seen])
-    return Bundle(moved, supported, place, to_start.scale * errors.point_cam[agree, 2], sigma)
+    at_start = _reproject(problem, T_start, _start_points(problem, T_start, depth)).size < _OUTLIER * sigma
+    depths = to_start.scale * errors.point_cam[agree, 2]
+    return Bundle(moved, supported, place, depths, sigma, float(at_start[agree].mean()))
 
 
 def _solution(

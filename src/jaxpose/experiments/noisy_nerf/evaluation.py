@@ -34,6 +34,12 @@ PROTOCOL = {
 }
 
 
+# Where what photographs share contradicts the poses of the data.
+CONTRADICTED_PROTOCOL = PROTOCOL | {
+    "image_metrics": "psnr, ssim, lpips: mean over the held-out views, from where the trajectory is at their "
+    "times, as the data's poses disagree with the photographs; test_time_refined: after test-time refinement "
+    "of each pose on its photograph",
+}
 # Where no pose is known there is nothing to align with, and no view can be placed but by training on it.
 UNPOSED_PROTOCOL = {
     **dict.fromkeys(PROTOCOL, "not measured: no poses are known"),
@@ -59,9 +65,13 @@ def measure(
     model: Model,
     state: State,
     T_world_cam: Float[np.ndarray, "n 4 4"],
+    T_held_out: Float[np.ndarray, "m 4 4"] | None,
     on_update: OnUpdate,
 ) -> Measured:
-    """Errors of the trained poses, and of what the scene shows from held-out ones, else from trained ones."""
+    """Errors of the trained poses, and of what the scene shows from held-out ones, else from trained ones.
+
+    `T_held_out` are those in the world of the training; None: the stated ones, brought there.
+    """
     viewer = photometric.viewer(
         model.scene,
         problem.train.camera,
@@ -79,10 +89,11 @@ def measure(
     at_start = trajectory_error.pose_errors(problem.T_start, ground_truth)
     to_estimate = trajectory_error.procrustes(ground_truth, T_world_cam)
     keys = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), 1), len(problem.held_out.t))
+    if T_held_out is None:
+        T_held_out = trajectory_error.align(to_estimate, problem.held_out.T_world_cam)
     as_aligned, as_refined, views = [], [], []
     on_update(Update("rendering held-out views", 0, len(keys), "views"))
-    for index, key in enumerate(keys):
-        pose = trajectory_error.align(to_estimate, problem.held_out.T_world_cam[index : index + 1])[0]
+    for index, (key, pose) in enumerate(zip(keys, T_held_out, strict=True)):
         image, view = _seen(viewer, scene, problem.held_out, index, pose)
         as_aligned.append(image)
         views.append(view)

@@ -58,7 +58,8 @@ class Config:
     # fast: poses by features that photographs share, then a scene of planes with the pose field; joint: all
     # by the colours, with a small network for CPUs; paper: so with BARF's network and the paper's schedule.
     preset: Preset = "fast"
-    # Of the poses that the run starts from. "none": as the data has them; "unknown": all in one place.
+    # Of the poses that the run starts from. "none": as the data has them, unless the photographs contradict
+    # them; "unknown": all in one place.
     noise: Literal["correlated", "independent", "none", "unknown"] = "correlated"
     noise_translation: float = 0.2  # largest deviation, as a share of the largest distance between cameras
     noise_rotation_deg: float = 0.0  # [deg] largest deviation

@@ -26,7 +26,13 @@ from jaxpose.experiments import devices, training_loop
 from jaxpose.experiments.command import MODULE, Command, execute
 from jaxpose.experiments.devices import Job
 from jaxpose.experiments.noisy_nerf import registration
-from jaxpose.experiments.noisy_nerf.evaluation import PROTOCOL, UNPOSED_PROTOCOL, Measured, measure
+from jaxpose.experiments.noisy_nerf.evaluation import (
+    CONTRADICTED_PROTOCOL,
+    PROTOCOL,
+    UNPOSED_PROTOCOL,
+    Measured,
+    measure,
+)
 from jaxpose.experiments.noisy_nerf.model import (
     Model,
     build,
@@ -167,8 +173,12 @@ def _single(
     devices.leave(job)
     if not job.writes:
         return devices.followed(job)
-    T_world_cam = training_loop.pose_reader(model.field, problem.train.t)(trained.state.pose)
-    measured = measure(config, problem, model, trained.state, T_world_cam, on_update)
+    poses_at = lambda t: training_loop.pose_reader(model.field, t)(trained.state.pose)
+    contradicted = config.noise == "none" and registered is not None and not registered.given
+    T_held_out = poses_at(problem.held_out.t) if contradicted else None
+    T_world_cam = poses_at(problem.train.t)
+    measured = measure(config, problem, model, trained.state, T_world_cam, T_held_out, on_update)
+    protocol = CONTRADICTED_PROTOCOL if contradicted else PROTOCOL
     on_update(Update("drawing figures"))
     _draw(folder, config, problem, measured, trained)
     _write_poses(folder, config, problem, measured)
@@ -182,7 +192,7 @@ def _single(
         data=problem.metadata,
         registration=registration.summary(problem, registered),
         training=describe(config, model),
-        protocol=PROTOCOL if measured.posed else UNPOSED_PROTOCOL,
+        protocol=protocol if measured.posed else UNPOSED_PROTOCOL,
         shutter=found_shutter(config, model, trained.state.pose),
         **measured.numbers,
     )

@@ -19,6 +19,9 @@ from jaxpose.structure import adjust, find_tracks
 _CORE = {"depth": (0.5, 99.5), "disparity": (10.0, 90.0)}
 _MARGIN = 1.3  # times the extent of the points, as surfaces without features go on
 _NEARER, _FARTHER = 0.7, 1.3  # times the depths that 98% of observations have
+_MOST = (
+    2 / 3
+)  # of the observations; with calibrated poses it is 0.8, with those as far off as by features 0.4 to 0.8
 _WHAT = "the registration of a run"
 
 
@@ -33,10 +36,15 @@ class Registered(NamedTuple):
     far: float
     points: int
     noise_px: float
+    given: bool  # these are the poses of the data, as the photographs agree with them
 
 
 def register(config: Config, problem: Problem, on_update: OnUpdate) -> Registered | None:
-    """Find poses by features of the photographs alone; None where these share too little."""
+    """Find poses by features of the photographs alone; None where these share too little.
+
+    Poses that the data state stay where most of what the photographs share agrees with them: no pose by
+    features is as good as a calibrated one.
+    """
     photographs = problem.train
     tracks = find_tracks(
         photographs.rgb,
@@ -54,8 +62,9 @@ def register(config: Config, problem: Problem, on_update: OnUpdate) -> Registere
     near, far = np.percentile(bundle.depth, (1, 99))
     centre, half = (low + high) / 2, np.maximum(_MARGIN * (high - low) / 2, 1e-2 * (far - near))
     is_open = photographs.spacing == "disparity"
+    given = config.noise == "none" and bundle.start_agrees > _MOST
     return Registered(
-        problem.T_start if config.noise == "none" else bundle.T_world_cam,
+        problem.T_start if given else bundle.T_world_cam,
         bundle.supported,
         _three(centre),
         _three(half),
@@ -63,13 +72,15 @@ def register(config: Config, problem: Problem, on_update: OnUpdate) -> Registere
         max(photographs.far, far) if is_open else _FARTHER * far,
         len(bundle.points),
         bundle.noise_px,
+        given,
     )
 
 
 def summary(problem: Problem, registered: Registered | None) -> dict[str, Any]:
     """The registration in numbers, for `results.json`."""
     if registered is None:
-        return {"photographs": 0, "points": 0, "noise_px": None, "rotation_error_deg": None}
+        nothing = dict.fromkeys(("noise_px", "given_poses_kept", "rotation_error_deg"))
+        return {"photographs": 0, "points": 0, **nothing}
     truth = problem.train.T_world_cam
     known = np.isfinite(truth).all()
     error = trajectory_error.pose_errors(registered.T_world_cam, truth).rotation_deg if known else None
@@ -77,6 +88,7 @@ def summary(problem: Problem, registered: Registered | None) -> dict[str, Any]:
         "photographs": int(registered.supported.sum()),
         "points": registered.points,
         "noise_px": registered.noise_px,
+        "given_poses_kept": registered.given,
         "rotation_error_deg": error,
     }
 
@@ -85,7 +97,7 @@ def save(path: Path, registered: Registered) -> None:
     """Write a registration to a file that `load` reads; a far that may be infinite as its disparity."""
     content = registered._asdict()
     content["far_disparity"] = 1 / content.pop("far")
-    content["supported"] = registered.supported.astype(np.uint8)
+    content |= {"supported": registered.supported.astype(np.uint8), "given": np.uint8(registered.given)}
     with atomic.atomic(path) as temporary:
         np.savez(temporary, **content)
 
@@ -104,7 +116,8 @@ def load(path: Path, count: int) -> Registered:
     centre = number("centre", (3,), least=-FARTHEST_M, most=FARTHEST_M)
     points = int(number("points", whole=True, least=0))
     noise_px = float(number("noise_px", least=0))
-    return Registered(T, supported > 0, _three(centre), _three(half), near, far, points, noise_px)
+    given = bool(number("given", least=0, most=1))
+    return Registered(T, supported > 0, _three(centre), _three(half), near, far, points, noise_px, given)
 
 
 def _three(values: Float[np.ndarray, "3"]) -> tuple[float, float, float]:

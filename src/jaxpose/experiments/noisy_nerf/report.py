@@ -54,6 +54,7 @@ def _registered(found: dict[str, Any] | None) -> list[str]:
     if not found or not found["photographs"]:
         return []
     error = "" if found["rotation_error_deg"] is None else f": {found['rotation_error_deg']:.2f} deg"
+    error = ": the poses of the data agree, and stay" if found["given_poses_kept"] else error
     return [
         f"  features     place {found['photographs']} photographs by {found['points']} points, "
         f"{found['noise_px']:.2f} px{error}"
