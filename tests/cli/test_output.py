@@ -70,7 +70,9 @@ def test_an_interrupt_that_a_library_swallows_ends_the_loading():
 def test_interrupted_while_it_is_loading(module):
     """Right after a module of those that the command imports, which Python itself tells."""
     command = [sys.executable, "-X", "importtime", "-m", "jaxpose", "slam", "--data", "none"]
+    heard = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
     process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    signal.signal(signal.SIGINT, heard)
     said = []
     for line in process.stderr:
         if not line.startswith(("import time:", "  ")):  # nor of its progress

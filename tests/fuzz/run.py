@@ -27,6 +27,7 @@ from typing import Any
 sys.path.insert(1, str(Path(__file__).parents[1]))  # what tests share
 SLOWEST_S, MOST_BYTES = 10.0, 1 << 30
 TOGETHER = 10_000  # cases of a process, whose memory grows
+_TELL_S = 5.0
 DEAD_S, ASLEEP_S = 30.0, 600.0  # of the processor, and of the clock, after which a case is ended
 
 
@@ -145,7 +146,7 @@ def fuzz(seconds: float, names: list[str] | None = None, seed: int = 0, first: i
     names = names or list(targets.TARGETS)
     faults: collections.Counter[str] = collections.Counter()
     examples: dict[str, int] = {}
-    number, peak, ends = first, 0, time.monotonic() + seconds
+    number, peak, ends, told = first, 0, time.monotonic() + seconds, time.monotonic()
     while (left := ends - time.monotonic()) > 1:
         command = [sys.executable, __file__, "--worker", "--seconds", str(left), "--seed", str(seed)]
         command += ["--first", str(number), "--targets", *names]
@@ -156,6 +157,11 @@ def fuzz(seconds: float, names: list[str] | None = None, seed: int = 0, first: i
                 said = json.loads(line)
                 peak, ended = max(peak, said.get("peak_bytes", 0)), ended or "peak_bytes" in said
                 number = said.get("case", number)
+                if time.monotonic() - told > _TELL_S:
+                    told = time.monotonic()
+                    print(
+                        f"{number - first} cases, {sum(faults.values())} faults", file=sys.stderr, flush=True
+                    )
                 if "fault" in said:
                     fault = f"{said['target']} {said['file']}: {re.sub(r'/tmp/[^ ]*/', '', said['fault'])}"
                     faults[fault] += 1

@@ -223,17 +223,22 @@ def _stored(folder: Path, problem: Problem) -> Registered | None:
 
 def _draw(folder: Path, config: Config, problem: Problem, measured: Measured, trained: Trained) -> None:
     numbers, title = measured.numbers, _title(problem)
-    found = (
-        f"{config.pose}: no poses are known to compare with"
-        if not measured.posed
-        else (
-            f"{config.pose}: rotation {numbers['start']['rotation_error_deg']:.2f} to "
-            f"{numbers['rotation_error_deg']:.3f} deg, translation "
-            f"{numbers['start']['translation_error_percent']:.2f} to "
+    start, stated = numbers["start"], config.noise == "none"  # the start is then what one compares with
+    if not measured.posed:
+        found = f"{config.pose}: no poses are known to compare with"
+    elif stated:
+        found = (
+            f"{config.pose}: away from the poses of the data by {numbers['rotation_error_deg']:.3f} deg and "
             f"{numbers['translation_error_percent']:.3f}% of the cameras' extent"
         )
-    )
-    ground_truth = problem.train.T_world_cam if measured.posed else None
+    else:
+        found = (
+            f"{config.pose}: rotation {start['rotation_error_deg']:.2f} to "
+            f"{numbers['rotation_error_deg']:.3f} deg, translation "
+            f"{start['translation_error_percent']:.2f} to "
+            f"{numbers['translation_error_percent']:.3f}% of the cameras' extent"
+        )
+    ground_truth = problem.train.T_world_cam if measured.posed and not stated else None
     nerf_plots.cameras(
         folder / "cameras.png", ground_truth, measured.T_start, measured.T_estimate, f"{title}\n{found}"
     )
