@@ -72,6 +72,16 @@ def test_the_trajectory_is_found_at_all_times(found):
     assert np.degrees(np.sqrt(np.mean(angle**2))) < 0.15
 
 
+def test_times_are_asked_together_or_one_by_one(found):
+    """More than one call of the compiled function takes, fewer, and none."""
+    t = np.linspace(*found.span, 300)
+    T, P = found.pose(t), found.covariance(t)
+    for k in (0, 255, 256, 299):
+        np.testing.assert_allclose(found.pose(t[k]), T[k : k + 1], atol=1e-12)
+        np.testing.assert_allclose(found.covariance(t[k]), P[k : k + 1], rtol=1e-9)
+    assert found.pose(t[:0]).shape == (0, 4, 4) and found.covariance(t[:0]).shape == (0, 6, 6)
+
+
 def test_the_sensors_are_found(found):
     s = found.sensors
     assert abs(s.offset_s - OFFSET_S) < 1e-3

@@ -24,6 +24,9 @@ def test_poses_far_off_are_found_among_wrong_matches():
     assert errors.rotation_deg < 0.1 and errors.centre < 0.01
     assert found.noise_px == pytest.approx(0.2, rel=0.25)
     assert_allclose(np.median(found.depth), 4.0, rtol=0.1)
+    assert found.start_agrees < 0.3
+    from_truth = adjust(tracks, T, depth=4.0)
+    assert from_truth is not None and from_truth.start_agrees > 0.9
 
 
 def test_against_scipy():

@@ -112,9 +112,10 @@ def adjust(
     agree &= supported[problem.view]
     seen = np.unique(problem.point[agree])
     place = to_start.apply(points[seen])
-    at_start = _reproject(problem, T_start, _start_points(problem, T_start, depth)).size < _OUTLIER * sigma
     depths = to_start.scale * errors.point_cam[agree, 2]
-    return Bundle(moved, supported, place, depths, sigma, float(at_start[agree].mean()))
+    right = _of_some(_tracks(problem, len(T)), np.flatnonzero(agree), problem.nearest)
+    at_start = _reproject(right, T_start, _start_points(right, T_start, depth)).size
+    return Bundle(moved, supported, place, depths, sigma, float(np.mean(at_start < _OUTLIER * sigma)))
 
 
 def _solution(
@@ -154,11 +155,18 @@ def _problem(tracks: Tracks, nearest: float) -> _Problem | None:
     _, group = connected_components(seen, directed=False)
     kept = group[tracks.view] == np.bincount(group[:n]).argmax()
     kept = np.flatnonzero(kept)[np.argsort(tracks.view[kept], kind="stable")]
+    return _of_some(tracks, kept, nearest) if len(kept) else None
+
+
+def _of_some(tracks: Tracks, kept: np.ndarray, nearest: float) -> _Problem:
+    """Some of the observations, in order of their views; points are numbered anew."""
     view, (_, point) = tracks.view[kept], np.unique(tracks.point[kept], return_inverse=True)
-    if len(view) == 0:
-        return None
-    by_view, by_point = sums(view, n), sums(point, int(point.max()) + 1)
+    by_view, by_point = sums(view, tracks.views), sums(point, int(point.max()) + 1)
     return _Problem(view, point, tracks.xy_cam[kept], tracks.focal, nearest, by_view, by_point)
+
+
+def _tracks(problem: _Problem, views: int) -> Tracks:
+    return Tracks(problem.view, problem.point, problem.xy, views, problem.focal)
 
 
 def _starts(
@@ -166,8 +174,7 @@ def _starts(
 ) -> list[Float[np.ndarray, "n 4 4"]]:
     """The given poses, unless they are all in one place, and those that the photographs alone tell."""
     given = np.array(T_start, np.float64)
-    tracks = Tracks(problem.view, problem.point, problem.xy, len(given), problem.focal)
-    T, tied = global_poses(tracks)
+    T, tied = global_poses(_tracks(problem, len(given)))
     if tied.sum() < _FEWEST_TIED:
         return [given]
     in_world = align(_gauge(T[tied], given[tied], np.ones(1), depth), T)
