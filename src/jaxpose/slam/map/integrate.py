@@ -11,7 +11,7 @@ is registered from farther off (`sample_map`).
 """
 
 from collections.abc import Callable
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -230,6 +230,7 @@ def tangent_planes(depth: Float[Array, "h w"], camera: Camera) -> Float[Array, "
     return jnp.concatenate([normal, -jnp.sum(normal * point, axis=-1, keepdims=True)], axis=-1)
 
 
+@lru_cache(maxsize=4)
 def _rays(camera: Camera) -> Float[np.ndarray, "h w 3"]:
     """The rays of all pixels in camera axes (z = 1); a compiler takes seconds to undo their distortion."""
     return unproject_numpy(camera, pixel_grid(camera)).astype(np.float32)
