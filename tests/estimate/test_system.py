@@ -8,6 +8,7 @@ from helpers import hand_held
 
 from jaxpose import fields
 from jaxpose.estimate import inertial
+from jaxpose.estimate.factors import Factor
 from jaxpose.estimate.kinematics import basis, kinematics, segments
 from jaxpose.estimate.system import BLOCK, BORDER, Noise, Prior, Problem, State, residuals, retract
 from jaxpose.geometry import rigid
@@ -38,6 +39,12 @@ def test_the_motion_is_that_of_the_field_by_forward_mode(control):
             np.testing.assert_allclose(R @ inward, there.acceleration_world, atol=1e-9)
 
 
+def sped(T_world_cam, twist, datum):
+    """A residual of a user, of all that a camera's motion has: its place and its velocity in the world."""
+    velocity = T_world_cam[:3, :3] @ twist[:3]
+    return jnp.concatenate([velocity * T_world_cam[2, 3] - datum, jnp.sin(twist[3:]) * datum])
+
+
 def test_every_derivative_is_that_of_finite_differences(control):
     rng = np.random.default_rng(0)
     poses = np.array([0.07, 0.5, 0.93])
@@ -60,6 +67,7 @@ def test_every_derivative_is_that_of_finite_differences(control):
             jnp.asarray(0.2), jnp.asarray(reduced.root), jnp.asarray(reduced.value), jnp.ones(2),
             jnp.asarray(poses), jnp.asarray(measured), jnp.asarray(roots),
             *jnp.asarray(7 * np.tril(rng.normal(size=(2, 2, 6, 6)))), jnp.asarray(0.8), state, prior,
+            (Factor(jnp.asarray(poses[::-1] - 0.03), jax.tree_util.Partial(sped), jnp.asarray([0.3, 2, 1])),),
         )  # fmt: skip
         at = jax.jit(residuals)
         found = at(problem, state, noise)
@@ -67,7 +75,7 @@ def test_every_derivative_is_that_of_finite_differences(control):
         groups = {
             "inertial": (found.inertial, np.arange(2)), "motion": (found.motion, np.arange(2)),
             "walk": (found.walk, np.arange(2)), "drift": (found.drift, np.arange(2)),
-            "poses": (found.poses, np.asarray(found.pair)),
+            "poses": (found.poses, np.asarray(found.pair)), "sped": found.factors[0],
         }  # fmt: skip
         step = 1e-6
         for unknown in range(3 * BLOCK + BORDER):
@@ -79,8 +87,10 @@ def test_every_derivative_is_that_of_finite_differences(control):
             ahead = at(problem, retract(state, jnp.asarray(row), jnp.asarray(corner)), noise)
             back = at(problem, retract(state, jnp.asarray(-row), jnp.asarray(-corner)), noise)
             for name, (rows, pair) in groups.items():
-                by = lambda x, name=name: np.asarray(getattr(x, name).residual)
+                of = lambda x, name=name: x.factors[0][0] if name == "sped" else getattr(x, name)
+                by = lambda x, of=of: np.asarray(of(x).residual)
                 slope = (by(ahead) - by(back)) / (2 * step)
+                pair = np.asarray(pair)
                 column = unknown - BLOCK * pair if unknown < 3 * BLOCK else unknown - BLOCK + 0 * pair
                 J = np.asarray(rows.jacobian)
                 there = (

@@ -12,6 +12,8 @@ from numpy.typing import ArrayLike
 from jaxpose._checks import check_increasing, check_shapes
 from jaxpose.errors import DataError
 from jaxpose.estimate import alignment, inertial, solver
+from jaxpose.estimate.factors import Factor
+from jaxpose.estimate.factors import checked as checked_factors
 from jaxpose.estimate.noise_levels import calibrated, first_levels
 from jaxpose.estimate.posterior import Posterior, posterior_of
 from jaxpose.estimate.system import Prior, Problem, State
@@ -51,6 +53,7 @@ def smooth(
     knots_hz: float | None = None,
     drift: ArrayLike | None = None,
     drift_s: float = np.inf,
+    factors: Sequence[Factor] = (),
 ) -> Posterior:
     """The most likely trajectory through camera poses and inertial readings, and how sure it is.
 
@@ -75,6 +78,7 @@ def smooth(
             share, over its right increment: as cameras are registered to a map that earlier ones made. None:
             errors are independent.
         drift_s: time [s] in which that shared error falls to 1/e, as what was mapped first is seen again.
+        factors: what else was measured within the time of the poses, in their world and on their clock.
 
     Returns:
         The posterior.
@@ -89,7 +93,7 @@ def smooth(
     """
     if not drift_s > 0:
         raise ValueError(f"drift_s: expected seconds above 0, got {drift_s}")
-    measured = _measured(times, T_world_cam, sigmas, drift, imu, use, estimate, noise, offset_s)
+    measured = _measured(times, T_world_cam, sigmas, drift, imu, use, estimate, noise, offset_s, factors)
     guess = _guess(measured, T_body_cam, gravity_world, offset_s)
     return _solved(measured, guess, fit_noise, knots_hz, drift_s)
 
@@ -105,6 +109,7 @@ class _Measured(NamedTuple):
     used: Float[np.ndarray, "2"]
     noise: ImuNoise | None
     estimate: tuple[str, ...]
+    factors: tuple[Factor, ...]
 
 
 class _Guess(NamedTuple):
@@ -116,7 +121,9 @@ class _Guess(NamedTuple):
     scale: float
 
 
-def _measured(times, T_world_cam, sigmas, drift, imu, use, estimate, noise, offset_s: float) -> _Measured:
+def _measured(
+    times, T_world_cam, sigmas, drift, imu, use, estimate, noise, offset_s: float, factors
+) -> _Measured:
     t, T = checked_poses(times, T_world_cam)
     if len(t) < 2:
         raise ValueError("poses: expected at least two, got one")
@@ -133,7 +140,8 @@ def _measured(times, T_world_cam, sigmas, drift, imu, use, estimate, noise, offs
     if drift is not None:
         drift = np.asarray(drift, np.float64)
         check_shapes(drift=(drift, f"{len(t)} 6 6"))
-    return _Measured(t, T, root, drift, imu, used, noise, names)
+    known = checked_factors(factors, (t[0], t[-1]))
+    return _Measured(t, T, root, drift, imu, used, noise, names, known)
 
 
 def _guess(measured: _Measured, T_body_cam, gravity_world, offset_s: float) -> _Guess:
@@ -201,6 +209,7 @@ def _solved(
             kept=f(np.exp(-3 * (last - first) / intervals / drift_s)),
             start=state,
             prior=prior,
+            factors=jax.tree.map(jnp.asarray, tuple(x._replace(t=x.t - first) for x in measured.factors)),
         )
         level, usual = jax.tree.map(f, levels)
         at = solver.optimise(problem, state, level)

@@ -10,6 +10,7 @@ Poses that are registered to a map which earlier ones made share its errors: T_m
 drift walks by steps that are small beside the camera, and is forgotten as what was mapped is seen again.
 """
 
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import jax
@@ -18,8 +19,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxpose.estimate.blocks import Blocks
+from jaxpose.estimate.factors import Factor, linearised
 from jaxpose.estimate.inertial import NODES, PLACES, lagrange
-from jaxpose.estimate.kinematics import Kinematics, Segment, basis, kinematics, segments
+from jaxpose.estimate.kinematics import Kinematics, Segment, ad, basis, kinematics, segments
+from jaxpose.estimate.rows import Rows, robust, robust_cost
 from jaxpose.geometry import se3
 from jaxpose.imu.types import AnyArray
 
@@ -30,7 +33,6 @@ GRAVITY, OFFSET, MOUNTING, SCALE = slice(0, 2), slice(2, 3), slice(3, 9), slice(
 _PAIR = 2 * BLOCK  # what an interval's residuals depend on beside the border
 _FIXED = 1e-9  # [m, rad] sigma of the drift of the first pose, which the world's frame is that of
 _RIDGE = 1e-3  # share of a motion's likely smallness that holds beside readings, so that all is determined
-HUBER = 16.81  # squared distance of a pose from which it counts by its size: 99% of chi^2 with 6 degrees
 
 
 class State(NamedTuple):
@@ -80,13 +82,7 @@ class Problem(NamedTuple):
     kept: Float[Array, ""]  # share of the drift that is left after a block
     start: State  # what the border's prior is about
     prior: Prior
-
-
-class Rows(NamedTuple):
-    """Whitened residuals with their derivatives by a pair of blocks and the border."""
-
-    residual: Float[Array, "*n"]
-    jacobian: Float[Array, "*n 70"]
+    factors: tuple[Factor, ...] = ()  # times on the spline's clock less the offset
 
 
 class Residuals(NamedTuple):
@@ -98,23 +94,31 @@ class Residuals(NamedTuple):
     motion: Rows  # (pairs, 3, 6)
     walk: Rows  # (pairs, 6)
     drift: Rows  # (pairs, 6)
+    factors: tuple[tuple[Rows, Int[Array, " q"]], ...]  # (times, m) each, and the pair of each time
 
 
 def residuals(problem: Problem, state: State, noise: Noise) -> Residuals:
     """Everything that was measured beside what the state predicts, whitened, and its derivatives."""
     segment = segments(state.control)
     count = segment.start.shape[0]
-    index, places = _where(problem, state, problem.t + state.offset_s)
+    t = [problem.t, *(factor.t for factor in problem.factors)]
+    index, places = _where(problem, state, jnp.concatenate(t) + state.offset_s)
     index = jnp.concatenate([jnp.repeat(jnp.arange(count, dtype=index.dtype), NODES), index])
     places = jnp.concatenate([jnp.tile(jnp.asarray(PLACES, places.dtype), count), places])
-    at = along(problem, segment, index, places)  # at nodes and poses alike: compiled once
+    at = along(problem, segment, index, places)  # at nodes, poses and factors alike: compiled once
     at_nodes = jax.tree.map(lambda x: x[: count * NODES].reshape(count, NODES, *x.shape[1:]), at)
-    at_poses = jax.tree.map(lambda x: x[count * NODES :], at)
-    pose_rows, pair = _poses(problem, state, noise, index[count * NODES :], at_poses)
+    ends = np.cumsum([count * NODES] + [x.shape[0] for x in t])
+    (index_of_poses, at_poses), *others = [
+        (index[a:b], jax.tree.map(lambda x, a=a, b=b: x[a:b], at)) for a, b in pairwise(ends)
+    ]
+    pose_rows, pair = _poses(problem, state, noise, index_of_poses, at_poses)
+    factors = tuple(
+        _factor(problem, state, factor, *where) for factor, where in zip(problem.factors, others, strict=True)
+    )
     inertial, motion = _inertial(problem, state, noise, at_nodes), _motion(problem, noise, at_nodes)
     to_camera = problem.to_camera / _pose_scale(noise)[None, :, None]
     drift = _steps(state.drift, problem.root_drift @ to_camera, DRIFT, problem.kept)
-    return Residuals(inertial, pose_rows, pair, motion, _walk(problem, state), drift)
+    return Residuals(inertial, pose_rows, pair, motion, _walk(problem, state), drift, factors)
 
 
 def _inertial(problem: Problem, state: State, noise: Noise, at: Kinematics) -> Rows:
@@ -201,16 +205,38 @@ def _poses(
     J = by_pose[..., :6] @ J
     J = J.at[..., 24 + OFFSET.start].add(jnp.einsum("pij,pj->pi", by_drift, slope))
     J = jnp.concatenate([J[..., :-1], J[..., -1:] + by_pose[..., 6:]], axis=-1)
-    J = jnp.concatenate([J[..., :24], J[..., 24:] * _free(problem)[None, None]], axis=-1)
+    J = _of_free(problem, J)
     scale = _pose_scale(noise)
     r = jnp.einsum("pij,pj->pi", problem.root_information, r / scale[None])
     J, by_drift = (problem.root_information @ (x / scale[None, :, None]) for x in (J, by_drift))
     early, late = (share[..., None] * by_drift for share in (1 - late, late))
     beside = jnp.concatenate([0 * early, early, 0 * late, late], axis=-1)
-    far = jnp.maximum(jnp.sum(r * r, axis=-1), HUBER)
-    root_weight = (HUBER / far) ** 0.25
     placed = _placed((index % 3)[:, None, None], J[..., :24], beside, J[..., 24:])
-    return Rows(r * root_weight[:, None], placed * root_weight[:, None, None]), pair
+    return robust(r, placed), pair
+
+
+def _factor(
+    problem: Problem, state: State, factor: Factor, index: Int[Array, " q"], at: Kinematics
+) -> tuple[Rows, Int[Array, " q"]]:
+    """What users measured of the camera's pose and twist."""
+    T, J_pose = jax.vmap(_camera, (0, None))(at, state)
+    twist, J_twist = jax.vmap(_camera_twist, (0, None))(at, state)
+    r, J = linearised(factor, T, J_pose, twist, J_twist)
+    return robust(r, _beside_pairs(problem, index, J)), index // 3
+
+
+def _of_free(problem: Problem, J: Float[Array, "*n 34"]) -> Float[Array, "*n 34"]:
+    """Derivatives by four control poses and what is free of the border."""
+    free = _free(problem).reshape((1,) * (J.ndim - 1) + (BORDER,))
+    return jnp.concatenate([J[..., :24], J[..., 24:] * free], axis=-1)
+
+
+def _beside_pairs(
+    problem: Problem, index: Int[Array, " p"], J: Float[Array, "p m 34"]
+) -> Float[Array, "p m 70"]:
+    """Derivatives by four control poses and the border as those by a pair of blocks."""
+    J, none = _of_free(problem, J), jnp.zeros((*J.shape[:-1], 24), J.dtype)
+    return _placed((index % 3)[:, None, None], J[..., :24], none, J[..., 24:])
 
 
 def _pose_scale(noise: Noise) -> Float[Array, "6"]:
@@ -244,6 +270,16 @@ def _camera(at: Kinematics, state: State) -> tuple[Float[Array, "4 4"], Float[Ar
     return se3.compose(at.T, state.T_body_cam), jnp.concatenate(parts, axis=1)
 
 
+def _camera_twist(at: Kinematics, state: State) -> tuple[Float[Array, "6"], Float[Array, "6 34"]]:
+    """The camera's velocity and rate in its own axes, and their derivatives, as `_camera`'s."""
+    to_camera = se3.adjoint(se3.inverse(state.T_body_cam))
+    twist, zero = to_camera @ at.twist, jnp.zeros((6, 1), to_camera.dtype)
+    by_offset = (to_camera @ at.twist_rate)[:, None]
+    return twist, jnp.concatenate(
+        [to_camera @ at.twist_jacobian, zero, zero, by_offset, ad(twist), zero], axis=1
+    )
+
+
 def camera_rows(
     problem: Problem, state: State, t: Float[Array, " p"]
 ) -> tuple[Float[Array, "p 4 4"], Float[Array, "p 6 70"], Int[Array, " p"]]:
@@ -251,9 +287,7 @@ def camera_rows(
     index, place = _where(problem, state, t + state.offset_s)
     at = along(problem, segments(state.control), index, place)
     T, J = jax.vmap(_camera, (0, None))(at, state)
-    none = jnp.zeros((*J.shape[:-1], 24), J.dtype)
-    placed = _placed((index % 3)[:, None, None], J[..., :24], none, J[..., 24:] * _free(problem)[None, None])
-    return T, placed, index // 3
+    return T, _beside_pairs(problem, index, J), index // 3
 
 
 def normal_equations(problem: Problem, state: State, found: Residuals) -> tuple[Blocks, Float[Array, ""]]:
@@ -264,9 +298,12 @@ def normal_equations(problem: Problem, state: State, found: Residuals) -> tuple[
         for rows in (found.inertial, found.motion, found.walk, found.drift)
     ]
     J = jnp.concatenate(each, axis=1)  # with the residuals as its last column
-    of_poses = jnp.concatenate([found.poses.jacobian, found.poses.residual[..., None]], axis=-1)
     gram = jnp.swapaxes(J, 1, 2) @ J
-    total = gram + jax.ops.segment_sum(jnp.swapaxes(of_poses, 1, 2) @ of_poses, found.pair, pairs)
+    total, cost = gram, jnp.sum(gram[:, size, size])
+    for rows, pair in ((found.poses, found.pair), *found.factors):
+        each = jnp.concatenate([rows.jacobian, rows.residual[..., None]], axis=-1)
+        total += jax.ops.segment_sum(jnp.swapaxes(each, 1, 2) @ each, pair, pairs)
+        cost += robust_cost(rows)
     H, side = total[:, :size, :size], -total[:, :size, size]
 
     joined = lambda a, b: jnp.concatenate([a, 0 * a[:1]]) + jnp.concatenate([0 * b[:1], b])
@@ -284,10 +321,6 @@ def normal_equations(problem: Problem, state: State, found: Residuals) -> tuple[
     corner += jnp.diag(jnp.where(prior.free, corner_information, 1))
     corner_side -= jnp.where(prior.free, corner_information * away, 0)
     blocks = Blocks(diagonal, H[:, BLOCK:_PAIR, :BLOCK], border, corner, row, corner_side)
-    cost = jnp.sum(gram[:, size, size])
-    pose_square = jnp.sum(found.poses.residual**2, axis=-1)  # already times the weight
-    far = pose_square**2 / HUBER  # the unweighted square where it is beyond
-    cost += jnp.sum(jnp.where(far > HUBER, 2 * jnp.sqrt(HUBER * far) - HUBER, pose_square))
     cost += jnp.sum(information * first**2) + jnp.sum(_free(problem) * corner_information * away**2)
     return blocks, cost / 2
 
