@@ -27,13 +27,15 @@ from jaxpose.cli.view.command import Config
 from jaxpose.cli.view.scene import read_scene, up_direction
 from jaxpose.cli.view.types import WIDTH
 from jaxpose.errors import DataError
-from jaxpose.experiments.slam.map_file import SavedMap, read_map, write_map
+from jaxpose.experiments.slam.map_file import read_map, write_map
 from jaxpose.files import atomic, trajectories
 from jaxpose.files.camera_json import write_camera
 from jaxpose.files.ply import write_ply
 from jaxpose.geometry.camera import Camera
 from jaxpose.scenes.voxel_blocks import BlockConfig
+from jaxpose.slam import SavedMap
 from jaxpose.slam.map.texture import Texture
+from jaxpose.slam.tracking.features import Features
 
 COUNT, LAST, FIRST, SPEED = 9, 2.0, 5.0, 0.3  # frames, span [s], first timestamp [s], along x [m/s]
 CAMERA = Camera(100.0, 100.0, 79.5, 59.5, 160, 120)
@@ -77,7 +79,12 @@ def run(tmp_path):
     config = BlockConfig(0.1, 0.3)
     blocks = filled(config, (-2.0, -2.0, -0.4), (2.4, 2.0, 2.0), red_and_blue_wall)
     untextured = Texture(np.zeros(blocks.coords.shape[0], np.int32), np.zeros((1, 17, 17, 17, 4), np.uint8))
-    write_map(folder / "map.npz", SavedMap(config, blocks, untextured, np.array([0, 4])))
+    kept, few = (
+        np.array([0, 4]),
+        Features(np.ones((2, 3)), np.ones(2), np.ones(2), np.zeros((2, 32), np.uint8)),
+    )
+    saved = SavedMap(config, blocks, untextured, kept, poses_at(t)[kept], (few, few), (1.0, 0.02))
+    write_map(folder / "map.npz", saved)
     corners = np.array([[-1, -1, WALL], [1, -1, WALL], [1, 1, WALL]])
     write_ply(folder / "mesh.ply", corners, np.full((3, 3), 200, np.uint8), np.array([[0, 2, 1]]))
     atomic.write_json(folder / "results.json", {"experiment": "rgbd_slam"})
@@ -269,7 +276,7 @@ def test_a_map_of_another_kind(run):
     with np.load(run / "map.npz") as file:
         content = dict(file)
     np.savez(run / "map.npz", **(content | {"version": 1}))
-    with pytest.raises(DataError, match="map.npz: expected a map of version 3, got 1"):
+    with pytest.raises(DataError, match="map.npz: expected a map of version 4, got 1"):
         read_scene(run, 0)
     np.savez(run / "map.npz", **(content | {"keyframes": np.array([0, 9])}))
     with pytest.raises(DataError, match="map.npz: expected keyframes below 9, got 9"):
@@ -287,6 +294,18 @@ def test_a_map_of_another_kind(run):
         ({"texture_slot": np.full(count, 5)}, "texture_slot: expected .* from 0 to 0, got 5"),
         ({"texture_tiles": np.zeros((1, 17, 17, 17, 4))}, "texture_tiles: expected uint8 .* got float64"),
         ({"keyframes": np.array([-1])}, "keyframes: expected n whole numbers of at least 0, got -1"),
+        (
+            {"fusion": content["fusion"].astype(float)},
+            "fusion: expected int16 of 4 for each node, got float64",
+        ),
+        ({"keyframe_T_world_cam": np.zeros((2, 4, 4))}, "keyframe_T_world_cam: expected rigid transforms"),
+        ({"keyframe_T_world_cam": np.zeros((3, 4, 4))}, "keyframe_T_world_cam: expected .*, got shape"),
+        ({"usual": np.array([1.0, -1.0])}, "usual: expected 2 finite numbers from 0 .*, got -1"),
+        ({"feature_count": np.array([2, 3])}, "feature_count: expected 2 that sum up to 4, got 2 to 5"),
+        ({"feature_count": np.array([4])}, "feature_count: expected 2 that sum up to 4, got 1 to 4"),
+        ({"feature_depth": np.full(4, np.nan)}, "feature_depth: expected .* finite .*, got nan"),
+        ({"feature_scale": np.zeros(4)}, "feature_scale: expected .* above 0 .*, got 0"),
+        ({"feature_descriptor": np.zeros((4, 8))}, "feature_descriptor: expected uint8 .*, got float64"),
     ):
         np.savez(run / "map.npz", **(content | {name: np.asarray(value) for name, value in change.items()}))
         with pytest.raises(DataError, match=f"map.npz: {words}"):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxpose.errors import DataError
-from jaxpose.files.ply import read_points
+from jaxpose.files.ply import read_coloured_points, read_points, write_ply
 
 POINTS = np.array([[1.5, -2.25, 3.125], [0.1, 0.2, 0.3], [1e6, -1e-3, 7.0]])
 
@@ -58,8 +58,16 @@ TEXT = header("ascii", "float")
             TEXT.replace(b"element vertex 3", b"element camera 1\nproperty float f\nelement vertex 3"),
             r": expected a PLY header with .*, got camera first",
         ),
-        (TEXT + b"7 1 2 3 4\n", r": expected 3 vertices, got 1"),
-        (TEXT + b"7 1 2 3 4\n7 1 two 3 4\n", r": expected 3 lines of numbers below line 12, got .*two"),
+        (TEXT + b"7 1 2 3 4\n", r": expected 3 vertices, got at most 1"),
+        (TEXT + b"7 1 2 3 4\n\n\n" + b"\n" * 20, r": expected 3 vertices, got 1"),
+        (
+            header("ascii", "float", 2**32) + b"7 1 2 3 4\n" * 3,
+            r": expected 4294967296 vertices, got at most",
+        ),
+        (
+            TEXT + b"7 1 2 3 4\n7 1 two 3 4\n7 1 2 3 4\n",
+            r": expected 3 lines of numbers below line 12, got .*two",
+        ),
         (header("binary_little_endian", "float") + bytes(20), r": expected 3 vertices, got 1"),
         (header("binary_little_endian", "float", 10**13), r": expected 10000000000000 vertices, got 0"),
         (TEXT.replace(b"float y\n", b"float x\n"), r": expected vertices with x y z, got no y"),
@@ -75,6 +83,15 @@ def test_damaged_files_are_named(tmp_path, content, message):
     with pytest.raises(DataError, match=f"a.ply{message}") as error:
         read_points(tmp_path / "a.ply")
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("count", [b"4", b"9999999999999"])
+def test_coloured_points_that_are_not_all_there(tmp_path, count):
+    write_ply(tmp_path / "a.ply", POINTS, np.zeros((3, 3), np.uint8))
+    content = (tmp_path / "a.ply").read_bytes()
+    (tmp_path / "a.ply").write_bytes(content.replace(b"vertex 3", b"vertex " + count))
+    with pytest.raises(DataError, match=f"a.ply: expected {count.decode()} vertices, got 3"):
+        read_coloured_points(tmp_path / "a.ply")
 
 
 def test_a_point_without_a_place_stays_nan(tmp_path):

@@ -18,9 +18,11 @@ from jaxpose.datasets.events import registry as event_registry
 from jaxpose.datasets.photos import colmap as colmap_photographs
 from jaxpose.datasets.rgbd import registry as rgbd_registry
 from jaxpose.experiments.checks import own_folder
-from jaxpose.experiments.slam.map_file import SavedMap, read_map, write_map
+from jaxpose.experiments.slam.map_file import read_map, write_map
 from jaxpose.scenes.voxel_blocks import CHANNELS, NODES, BlockConfig, unpacked
+from jaxpose.slam import SavedMap
 from jaxpose.slam.map.texture import SIDE, Texture
+from jaxpose.slam.tracking.features import Features
 
 COUNT, WIDTH, HEIGHT = 4, 16, 12
 K = (15.0, 15.5, 7.5, 5.5)
@@ -196,12 +198,17 @@ def _map(folder: Path) -> None:
     values = np.full((2, NODES, NODES, NODES, CHANNELS), 1000, np.int16)
     slot = np.zeros(16, np.int32)
     texture = Texture(slot, np.zeros((1, SIDE, SIDE, SIDE, 4), np.uint8))
-    write_map(folder / "map.npz", SavedMap(config, unpacked(config, coords, values), texture, np.arange(3)))
+    few = Features(np.ones((2, 3)), np.ones(2), np.ones(2), np.zeros((2, 32), np.uint8))
+    poses, blocks = np.tile(np.eye(4), (3, 1, 1)), unpacked(config, coords, values)
+    saved = SavedMap(config, blocks, texture, np.arange(3), poses, (few, few, few), (1.0, 0.02))
+    write_map(folder / "map.npz", saved)
 
 
 def _read_map(folder: Path) -> Any:
     saved = read_map(folder / "map.npz")
-    return saved.config.voxel, np.asarray(saved.blocks.values), np.asarray(saved.keyframes)
+    features = [(f.direction_cam, f.depth, f.scale) for f in saved.features]
+    known = saved.T_world_cam, np.asarray(saved.usual), *sum(features, ())
+    return saved.config.voxel, np.asarray(saved.blocks.values), np.asarray(saved.keyframes), *known
 
 
 _SETTINGS = {"seed": 0, "field": {"width": 64, "rates": [1.0, 2.0]}, "data": "room"}

@@ -417,6 +417,7 @@ TARGETS = {
     "colmap_binary": Target(partial(_colmap, False), _read_colmap),
     "ply_text": Target(partial(_ply, True), _points),
     "ply_binary": Target(partial(_ply, False), _points),
+    "ply_coloured": Target(partial(_ply, False), _unseen(_of("a.ply", ply.read_coloured_points))),
     "tum_file": Target(_tum_file, _of("a.txt", trajectories.read_tum)),
     "euroc_file": Target(_euroc_file, _of("a.txt", trajectories.read_euroc)),
     "kitti_file": Target(

@@ -1,5 +1,6 @@
 """PLY files (Stanford's polygon format): point clouds and meshes."""
 
+from itertools import islice
 from pathlib import Path
 from typing import BinaryIO
 
@@ -34,15 +35,12 @@ def read_coloured_points(path: Path | str) -> tuple[Float[np.ndarray, "n 3"], UI
         DataError: Naming the file for what cannot be read.
     """
     path = Path(path)
-    with path.open("rb") as stream:
+    with path.open("rb") as stream, reading(path, "a PLY file"):
         form, count, properties, _ = _header(path, stream)
         wanted = dict.fromkeys(("red", "green", "blue"), "u1")
         if form == "ascii" or any(dict(properties).get(name) != code for name, code in wanted.items()):
             raise DataError(f"{path}: expected binary vertices with red green blue of 8 bits, got others")
-        kind = np.dtype([(name, _ORDERS[form] + code) for name, code in properties])
-        vertices = np.fromfile(stream, kind, count)
-    if len(vertices) != count:
-        raise DataError(f"{path}: expected {count} vertices, got {len(vertices)}")
+        vertices = _vertices(path, stream, form, count, properties)
     points = np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
     return points, np.stack([vertices[name] for name in wanted], axis=1)
 
@@ -69,12 +67,11 @@ def read_points(path: Path | str) -> Float[np.ndarray, "n 3"]:
             got = f"no {' '.join(missing)}" if missing else "none"
             raise DataError(f"{path}: expected vertices with x y z, got {got}")
         if form == "ascii":
+            most = (path.stat().st_size - stream.tell() + 1) // (2 * len(names))  # a digit and what ends it
+            if most < count:
+                raise DataError(f"{path}: expected {count} vertices, got at most {most}")
             return _text(path, stream, count, [names.index(axis) for axis in "xyz"], lines)
-        kind = np.dtype([(name, _ORDERS[form] + code) for name, code in properties])
-        there = (path.stat().st_size - stream.tell()) // kind.itemsize
-        if there < count:
-            raise DataError(f"{path}: expected {count} vertices, got {there}")
-        vertices = np.fromfile(stream, kind, count)
+        vertices = _vertices(path, stream, form, count, properties)
         points = np.empty((count, 3))
         for k, axis in enumerate("xyz"):
             points[:, k] = vertices[axis]
@@ -162,11 +159,22 @@ def _header(path: Path, stream: BinaryIO) -> tuple[str, int, list[tuple[str, str
     return form, count, properties, number
 
 
+def _vertices(
+    path: Path, stream: BinaryIO, form: str, count: int, properties: list[tuple[str, str]]
+) -> np.ndarray:
+    """The binary vertices after a header, a field for each property; DataError where the file has fewer."""
+    kind = np.dtype([(name, _ORDERS[form] + code) for name, code in properties])
+    there = (path.stat().st_size - stream.tell()) // kind.itemsize
+    if there < count:
+        raise DataError(f"{path}: expected {count} vertices, got {there}")
+    return np.fromfile(stream, kind, count)
+
+
 def _text(
     path: Path, stream: BinaryIO, count: int, columns: list[int], above: int
 ) -> Float[np.ndarray, "n 3"]:
     try:
-        points = np.loadtxt(stream, np.float64, usecols=columns, max_rows=count, ndmin=2, comments=None)
+        points = np.loadtxt(islice(stream, count), np.float64, usecols=columns, ndmin=2, comments=None)
     except ValueError as error:
         raise DataError(
             f"{path}: expected {count} lines of numbers below line {above}, got {error}"

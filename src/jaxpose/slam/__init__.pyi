@@ -11,11 +11,14 @@ from .config import TrackConfig as TrackConfig
 from .line_delay import estimate_line_delay as estimate_line_delay
 from .loops.types import Loops as Loops
 from .pipeline import Progress as Progress
-from .pipeline import SlamResult as SlamResult
 from .pipeline import finish as finish
 from .pipeline import init as init
 from .pipeline import run as run
 from .pipeline import step as step
+from .sessions import SavedMap as SavedMap
+from .sessions import begin_in as begin_in
+from .sessions import saved_map as saved_map
 from .types import Frames as Frames
+from .types import SlamResult as SlamResult
 from .types import SlamState as SlamState
 from .types import TrackingStatus as TrackingStatus

@@ -110,9 +110,8 @@ def _as_arrays(state: SlamState, size: dict[str, Any], blocks: int | None = None
     numbers = {name: np.asarray(getattr(state, name)) for name in _NUMBERS}
     motion = state.motion._replace(gyro_bias_sigma=np.asarray(state.motion.gyro_bias_sigma))
     state = state._replace(**numbers, motion=motion, camera=None, config=None, grid=None)
-    state = state._replace(
-        features=None, keyframe_features=(), images=(), readings=()
-    )  # the recording gives them again
+    # The recording gives these again, and the file of an earlier run its map.
+    state = state._replace(features=None, keyframe_features=(), images=(), readings=(), earlier=None)
     if state.map is not None and hasattr(state.map.params, "table"):
         rows = packed(state.map.params)
         if blocks is not None:

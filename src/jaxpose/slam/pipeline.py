@@ -11,17 +11,14 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from jaxpose.datasets.types import Frame, Recording, check_frame
 from jaxpose.errors import DataError
-from jaxpose.estimate import Posterior
-from jaxpose.fields import Covariances, Params, PoseField
 from jaxpose.geometry import rigid
 from jaxpose.geometry.camera import Camera, angle_of_view
 from jaxpose.imu import GRAVITY_WORLD, Gravity, Imu
-from jaxpose.scenes import SceneField
-from jaxpose.scenes.voxel_blocks import BlockConfig, Blocks, voxel_blocks
+from jaxpose.scenes.voxel_blocks import voxel_blocks
 from jaxpose.slam.batch import final_trajectory
 from jaxpose.slam.config import SlamConfig
 from jaxpose.slam.initial_pose import first_pose, upright_pose
@@ -29,16 +26,16 @@ from jaxpose.slam.keyframes import FrameReader, coarse_depth, keyframe_images, t
 from jaxpose.slam.loops.closure import with_loops
 from jaxpose.slam.loops.rebuild import EACH, resumed, with_room
 from jaxpose.slam.loops.refine import refined
-from jaxpose.slam.loops.types import Loops, no_loops
+from jaxpose.slam.loops.types import no_loops
 from jaxpose.slam.map.backend import as_blocks, framed_field, is_mapped, map_frame, seen_points
-from jaxpose.slam.map.texture import Texture, make_texture, textured
+from jaxpose.slam.map.texture import make_texture, painted_over, textured
 from jaxpose.slam.observation import to_device
 from jaxpose.slam.readings import all_readings, joined, readings_until
 from jaxpose.slam.tracker import expected_motion, next_pose, unrolled
 from jaxpose.slam.tracking.features import detect
 from jaxpose.slam.tracking.intrinsic_frame import is_due, make_refit, window
 from jaxpose.slam.tracking.predict import GYRO_BIAS_SIGMA
-from jaxpose.slam.types import Frames, Motion, SlamState, no_frames
+from jaxpose.slam.types import Motion, SlamResult, SlamState, no_frames
 
 _DEFAULT = SlamConfig()
 
@@ -50,30 +47,6 @@ class Progress(NamedTuple):
     count: int
     state: SlamState  # valid until the next frame, which writes over its map
     ground_truth_error: float
-
-
-class SlamResult(NamedTuple):
-    """A tracked sequence: poses, the map, and one continuous trajectory."""
-
-    T_world_cam: Float[np.ndarray, "n 4 4"]
-    T_world_cam_odometry: Float[np.ndarray, "n 4 4"]  # motions as tracked, put together without loops
-    frames: Frames
-    loops: Loops
-    coarser_at: Int[np.ndarray, " c"]  # frames at which voxels became twice as wide (`config.map_budget_gb`)
-    scene: SceneField
-    map_config: BlockConfig
-    scene_params: tuple[Blocks, Texture]
-    field: PoseField  # camera in the world, over seconds since the first frame
-    field_params: Params
-    field_rmse_m: float  # of the field at the frames' times to the tracked poses
-    field_rmse_deg: float
-    posterior: Posterior | None  # of a run with an IMU: covariance at any time, and the sensors
-    covariances: Covariances | None  # of the field
-
-    @property
-    def keyframes(self) -> Int[np.ndarray, " k"]:
-        """Which frames are keyframes."""
-        return np.flatnonzero(self.frames.keyframe)
 
 
 def init(
@@ -359,11 +332,15 @@ def _finish(state: SlamState, read: FrameReader, imu: Imu | None) -> SlamResult:
     config, blocks = as_blocks(state)
     keyframes = keyframe_images(read, np.flatnonzero(frames.keyframe), tracked)
     texture = make_texture(config, blocks, keyframes, state.camera)
+    if state.earlier is not None:
+        texture = painted_over(state.earlier.texture, texture)
     return SlamResult(
         T_world_cam_odometry=frames.T_odometry @ state.T_body_cam,
         frames=frames,
         loops=state.loops,
         coarser_at=state.coarser_at,
+        keyframe_features=state.keyframe_features,
+        earlier_blocks=0 if state.earlier is None else len(state.earlier.coords),
         scene=textured(voxel_blocks(config), config),
         map_config=config,
         scene_params=(blocks, jax.tree.map(jnp.asarray, texture)),
@@ -396,5 +373,6 @@ def _rigid(name: str, T: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
 def _ground_truth_error(recording: Recording, state: SlamState) -> float:
     if recording.T_world_cam is None:
         return float("nan")
-    estimate, i = state.frames.T_world_body[-1] @ recording.T_body_cam, state.frames.count - 1
-    return float(np.linalg.norm(recording.T_world_cam[i, :3, 3] - estimate[:3, 3]))
+    estimate, i = state.frames.T_world_body @ recording.T_body_cam, state.frames.count - 1
+    put_together = recording.T_world_cam[0] @ rigid.inverse(estimate[0]) @ estimate[i]
+    return float(np.linalg.norm(recording.T_world_cam[i, :3, 3] - put_together[:3, 3]))

@@ -8,15 +8,17 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Int8
 
 from jaxpose.datasets.types import Frame
-from jaxpose.fields import Params
+from jaxpose.estimate import Posterior
+from jaxpose.fields import Covariances, Params, PoseField
 from jaxpose.geometry import rigid
 from jaxpose.geometry.camera import Camera
 from jaxpose.imu import Imu
-from jaxpose.scenes import GridConfig
-from jaxpose.scenes.voxel_blocks import BlockConfig
+from jaxpose.scenes import GridConfig, SceneField
+from jaxpose.scenes.voxel_blocks import BlockConfig, Blocks
 from jaxpose.slam.config import SlamConfig
 from jaxpose.slam.loops.types import Loops
 from jaxpose.slam.map.photometric import MapState
+from jaxpose.slam.map.texture import Texture
 from jaxpose.slam.tracking.features import Features
 
 # Settings are no leaves of a state: a state is a pytree of arrays and numbers.
@@ -147,6 +149,14 @@ class Motion(NamedTuple):
     accelerometer_bias_world: Float[np.ndarray, "3"]  # [m/s^2] (`predict.observe_acceleration`)
 
 
+class EarlierMap(NamedTuple):
+    """The map of an earlier run, on the host: what this run's begins with, also where it is made anew."""
+
+    coords: Int[np.ndarray, "n 3"]  # `voxel_blocks.packed`
+    values: Int[np.ndarray, "n 9 9 9 8"]
+    texture: Texture
+
+
 class SlamState(NamedTuple):
     """A run after some frames: a pytree, whose settings (`config`, `grid`) are static.
 
@@ -178,3 +188,30 @@ class SlamState(NamedTuple):
     readings: tuple[Imu, ...]  # all of them, as they came, where no recording can give them again
     grid: BlockConfig | GridConfig | None  # how finely the map resolves space; None: before the first frame
     map: MapState | None
+    earlier: EarlierMap | None = None  # of a run that this one goes on in the map of (`sessions`)
+
+
+class SlamResult(NamedTuple):
+    """A tracked sequence: poses, the map, and one continuous trajectory."""
+
+    T_world_cam: Float[np.ndarray, "n 4 4"]
+    T_world_cam_odometry: Float[np.ndarray, "n 4 4"]  # motions as tracked, put together without loops
+    frames: Frames
+    loops: Loops
+    coarser_at: Int[np.ndarray, " c"]  # frames at which voxels became twice as wide (`config.map_budget_gb`)
+    keyframe_features: tuple[Features, ...]  # by which a later run finds where it is
+    earlier_blocks: int  # of the map, the first ones: what an earlier run has made (`sessions.begin_in`)
+    scene: SceneField
+    map_config: BlockConfig
+    scene_params: tuple[Blocks, Texture]
+    field: PoseField  # camera in the world, over seconds since the first frame
+    field_params: Params
+    field_rmse_m: float  # of the field at the frames' times to the tracked poses
+    field_rmse_deg: float
+    posterior: Posterior | None  # of a run with an IMU: covariance at any time, and the sensors
+    covariances: Covariances | None  # of the field
+
+    @property
+    def keyframes(self) -> Int[np.ndarray, " k"]:
+        """Which frames are keyframes."""
+        return np.flatnonzero(self.frames.keyframe)

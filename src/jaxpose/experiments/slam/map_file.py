@@ -3,39 +3,36 @@
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from jaxpose.errors import DataError
 from jaxpose.files import atomic
-from jaxpose.files.schema import check_version, numbers
+from jaxpose.files.schema import check_version, numbers, rigid_transforms
 from jaxpose.files.untrusted import read_npz
 from jaxpose.scenes.voxel_blocks import (
+    CHANNELS,
     NODES,
     BlockConfig,
-    Blocks,
     decoded,
     of_distance_and_colour,
     packed,
     unpacked,
 )
+from jaxpose.slam import SavedMap
 from jaxpose.slam.map.texture import SIDE, Texture
+from jaxpose.slam.tracking.features import Features
 
-_VERSION = 3
+_VERSION = 4
+_VALUES = 4  # of the channels of a node: distance and colour
+_STEP, _MOST_STEPS = 256, 127  # of numbers of 16 bits
 _TOGETHER = 256  # blocks
+_DESCRIPTOR = 32  # bytes
 _LARGEST_M = 1e4  # of voxels and distances
 _FARTHEST_BLOCK = 1023  # from the origin: a table of 256^3 bricks
-
-
-class SavedMap(NamedTuple):
-    """A map as a run folder keeps it, `map.npz`."""
-
-    config: BlockConfig
-    blocks: Blocks
-    texture: Texture  # finer colour on the surface
-    keyframes: Int[np.ndarray, " k"]  # frames, counted from the first of the trajectory
+_MOST_LOSS = 1e6  # sigmas; and of colour errors
 
 
 def write_map(path: Path | str, saved: SavedMap) -> None:
@@ -43,13 +40,19 @@ def write_map(path: Path | str, saved: SavedMap) -> None:
 
     `coords` (n, 3) say which block of space each is, 8 voxels wide and beginning at a multiple of that;
     `values` (n, 9, 9, 9, 4), float16, are signed distance [m] and colour of nodes, `texture_tiles` (m, 17,
-    17, 17, 4) finer colour and 255 where there is any, tile `texture_slot[k]` for block k.
+    17, 17, 4) finer colour and 255 where there is any, tile `texture_slot[k]` for block k. A later run goes
+    on with `fusion` (n, 9, 9, 9, 4), the rest of the nodes as the map stores them, and finds itself by what
+    begins with `keyframe` and `feature`.
     """
     coords, stored = packed(saved.blocks)
     arrays = asdict(saved.config) | {
         "coords": coords,
         "values": _distance_and_colour(saved.config, stored),
+        "fusion": _coarsened(stored[..., _VALUES:]),
         "keyframes": saved.keyframes,
+        "keyframe_T_world_cam": saved.T_world_cam,
+        "usual": np.array(saved.usual),
+        **_of_features(saved.features),
     }
     arrays |= {
         "texture_slot": np.asarray(saved.texture.slot)[1 : len(coords) + 1],
@@ -59,13 +62,38 @@ def write_map(path: Path | str, saved: SavedMap) -> None:
         np.savez_compressed(temporary, allow_pickle=False, version=_VERSION, **arrays)
 
 
+def _coarsened(fusion: Int[np.ndarray, "n 9 9 9 4"]) -> Int[np.ndarray, "n 9 9 9 4"]:
+    """Wide-band distances to a thousandth of their range and roots of weights to 1%: a third of the bytes."""
+    found = np.empty_like(fusion)
+    for start in range(0, len(fusion), _TOGETHER):
+        some = fusion[start : start + _TOGETHER].astype(np.int32)
+        coarse = _STEP * np.round(some / _STEP).astype(np.int32)
+        coarse[..., 1:] = np.where(some[..., 1:] > 0, np.maximum(coarse[..., 1:], _STEP), 0)  # known stays so
+        found[start : start + _TOGETHER] = np.clip(coarse, -_MOST_STEPS * _STEP, _MOST_STEPS * _STEP)
+    return found
+
+
+def _of_features(features: tuple[Features, ...]) -> dict[str, Any]:
+    """The features of all keyframes in a row, and how many each has."""
+    joined = lambda name, *shape: np.concatenate(
+        [np.zeros((0, *shape)), *(getattr(f, name) for f in features)]
+    )
+    return {
+        "feature_count": np.array([len(f.depth) for f in features], int),
+        "feature_direction": joined("direction_cam", 3)[:, :2].astype(np.float32),
+        "feature_depth": joined("depth").astype(np.float32),
+        "feature_scale": joined("scale").astype(np.float32),
+        "feature_descriptor": joined("descriptor", _DESCRIPTOR).astype(np.uint8),
+    }
+
+
 def _distance_and_colour(
     config: BlockConfig, stored: Int[np.ndarray, "n 9 9 9 8"]
 ) -> Float[np.ndarray, "n 9 9 9 4"]:
     """The first channels of the nodes, float16, made of a few blocks at a time: memory is the file's."""
-    values = np.empty((*stored.shape[:-1], 4), np.float16)
+    values = np.empty((*stored.shape[:-1], _VALUES), np.float16)
     for start in range(0, len(stored), _TOGETHER):
-        values[start : start + _TOGETHER] = decoded(config, stored[start : start + _TOGETHER])[..., :4]
+        values[start : start + _TOGETHER] = decoded(config, stored[start : start + _TOGETHER])[..., :_VALUES]
     return values
 
 
@@ -80,8 +108,14 @@ def read_map(path: Path | str) -> SavedMap:
     count, reach = len(coords), int(np.abs(coords).max(initial=0))
     if reach > min(_FARTHEST_BLOCK, count + 64) or len(np.unique(coords, axis=0)) != count:
         raise DataError(f"{path}: coords: expected blocks beside each other, got {reach} of {count} away")
-    number("values", (count, NODES, NODES, NODES, 4), least=-_LARGEST_M, most=_LARGEST_M)
-    blocks = unpacked(config, coords, of_distance_and_colour(config, content["values"]))
+    nodes = (count, NODES, NODES, NODES)
+    number("values", (*nodes, _VALUES), least=-_LARGEST_M, most=_LARGEST_M)
+    fusion = content.get("fusion")
+    if fusion is None or fusion.dtype != np.int16 or fusion.shape != (*nodes, CHANNELS - _VALUES):
+        got = "none" if fusion is None else f"{fusion.dtype} of shape {fusion.shape}"
+        raise DataError(f"{path}: fusion: expected int16 of {CHANNELS - _VALUES} for each node, got {got}")
+    stored = of_distance_and_colour(config, content["values"])[..., :_VALUES]
+    blocks = unpacked(config, coords, np.concatenate([stored, fusion], axis=-1))
     tiles = content.get("texture_tiles")
     if (
         tiles is None
@@ -94,4 +128,29 @@ def read_map(path: Path | str) -> SavedMap:
     slot = np.zeros(blocks.coords.shape[0], np.int32)
     slot[1 : count + 1] = number("texture_slot", (count,), whole=True, least=0, most=len(tiles) - 1)
     keyframes = number("keyframes", (None,), whole=True, least=0)
-    return SavedMap(config, blocks, Texture(slot, tiles), keyframes)
+    T_world_cam = number("keyframe_T_world_cam", (len(keyframes), 4, 4))
+    rigid_transforms(path, "keyframe_T_world_cam", T_world_cam)
+    loss, colour = number("usual", (2,), least=0, most=_MOST_LOSS).tolist()
+    features = _features(path, content, len(keyframes))
+    return SavedMap(config, blocks, Texture(slot, tiles), keyframes, T_world_cam, features, (loss, colour))
+
+
+def _features(path: Path | str, content: Any, keyframes: int) -> tuple[Features, ...]:
+    """The features of each keyframe; none of a run without."""
+    number = partial(numbers, path, content)
+    counts = number("feature_count", (None,), whole=True, least=0)
+    descriptor = content.get("feature_descriptor")
+    if descriptor is None or descriptor.dtype != np.uint8 or descriptor.shape[1:] != (_DESCRIPTOR,):
+        got = "none" if descriptor is None else f"{descriptor.dtype} of shape {descriptor.shape}"
+        raise DataError(f"{path}: feature_descriptor: expected uint8 (n, {_DESCRIPTOR}), got {got}")
+    total = len(descriptor)
+    if len(counts) not in (0, keyframes) or counts.sum() != total:
+        wanted = f"{keyframes} that sum up to {total}"
+        raise DataError(f"{path}: feature_count: expected {wanted}, got {len(counts)} to {counts.sum()}")
+    direction = number("feature_direction", (total, 2), least=-_LARGEST_M, most=_LARGEST_M)
+    depth = number("feature_depth", (total,), least=0, most=_LARGEST_M)
+    scale = number("feature_scale", (total,), above=0, most=_LARGEST_M)
+    direction = np.concatenate([direction, np.ones((total, 1))], axis=1)
+    ends = np.cumsum(counts)[:-1]
+    every = (np.split(x, ends) for x in (direction, depth, scale, descriptor))
+    return tuple(Features(*one) for one in zip(*every, strict=True)) if len(counts) else ()

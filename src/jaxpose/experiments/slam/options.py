@@ -26,7 +26,7 @@ FEWEST_FRAMES = 3  # three camera centres are the fewest that an alignment can b
 
 # The options of the first screen of help.
 GROUPS = {
-    "data": ("data", "recorded_hz", "rate_hz", "imu_file", "imu_extrinsics"),
+    "data": ("data", "recorded_hz", "rate_hz", "imu_file", "imu_extrinsics", "map"),
     "method": ("slam.imu", "compare", "slam.voxel", "slam.map_budget_gb", "slam.seed"),
     "run": ("out", "name", "resume", "smoke", "json"),
 }
@@ -71,6 +71,8 @@ class Options:
     imu_extrinsics: Path | None = None  # of --imu-file: T_body_cam as T_BS of a sensor.yaml, or 16 numbers
     imu_offset_s: float = 0.0  # [s] added to the timestamps of a recording's own IMU
     imu_filter: bool = False  # subtract that IMU's biases, estimated with the true poses as in the paper
+    # Run folder of a run in the same place, with features: go on in its map and its world, without --voxel.
+    map: Path | None = None
     compare: bool = False  # run all IMU modes and put them side by side
     resume: bool = False  # go on where a run of the same folder and settings was stopped
     smoke: bool = False  # everything shrunk to seconds; the numbers then mean nothing
@@ -84,7 +86,7 @@ class Options:
         check_positive(self, "recorded_hz", "rate_hz", "slam.voxel", "slam.map_every_s")
         check_finite(self, "imu_offset_s")
         check_least(self, start=0, frames=FEWEST_FRAMES)
-        check_run_folder(self, self.data, self.imu_file, self.imu_extrinsics, self.room.along)
+        check_run_folder(self, self.data, self.imu_file, self.imu_extrinsics, self.room.along, self.map)
         self._check_data()
         self._check_imu()
         self._check_method()
@@ -145,6 +147,10 @@ class Options:
             check_unused(self, ("slam.refine",), "with --track.method or --map.method gradient")
         if slam.map.method == "gradient":
             check_unused(self, ("slam.map_budget_gb",), "with --map.method gradient")
+        if self.map is not None:
+            check_unused(self, ("slam.voxel",), "with --map, whose voxels are as they are")
+            if not replace(slam, loops=True).uses_loops:
+                raise ValueError("--map: expected features and a fused map with it, as by default")
         if slam.map.method == "fused":
             check_unused(self, [f"slam.map.{n}" for n in _RENDERED_MAPPING], "with --map.method fused")
 

@@ -17,15 +17,17 @@ from jaxpose.experiments.command import Command, execute
 from jaxpose.experiments.outcome import Outcome, cost, read_results
 from jaxpose.experiments.progress import OnUpdate, Update, silent
 from jaxpose.experiments.slam.checkpointing import checkpoint_callback
+from jaxpose.experiments.slam.map_file import read_map
 from jaxpose.experiments.slam.options import GROUPS, HIDDEN, Options, resume_fingerprint, slam_config
 from jaxpose.experiments.slam.report import report, table, tracking_update
 from jaxpose.experiments.slam.run_files import write_run
 from jaxpose.experiments.slam.source import Source, load
 from jaxpose.files import atomic, run_folder, trajectories
 from jaxpose.plots import slam as slam_plots
-from jaxpose.slam import ImuMode, Progress, estimate_line_delay
+from jaxpose.slam import ImuMode, Progress, begin_in, estimate_line_delay
 from jaxpose.slam.checkpoint import load as load_checkpoint
 from jaxpose.slam.pipeline import run as track
+from jaxpose.slam.sessions import with_earlier
 
 _END = Update("fitting the continuous trajectory, texturing the map")
 
@@ -115,8 +117,13 @@ def _single(
         return read_results(finished, experiment), _written_errors(folder, recording)
     on_update(Update(f"compiling, IMU {mode}: the first frames are slow"))
     config, state = slam_config(options), None
+    earlier = None if options.map is None else read_map(options.map / "map.npz")
     if checkpoint.exists():
         state = load_checkpoint(checkpoint, recording, config)
+        state = state if earlier is None else with_earlier(state, earlier)
+    elif earlier is not None:
+        on_update(Update(f"looking for the first frame in the map of {options.map}"))
+        state = begin_in(earlier, recording, config)
     line_delay = {}
     if "line-delay" in config.estimate:
         found = estimate_line_delay(

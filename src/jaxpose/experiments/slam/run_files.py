@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from jaxpose.datasets.origin import moved
 from jaxpose.datasets.types import Recording
+from jaxpose.evaluation import trajectory_error
 from jaxpose.experiments.progress import OnUpdate, Update
 from jaxpose.experiments.slam.calibration import calibration_numbers
 from jaxpose.experiments.slam.evaluation import (
@@ -19,7 +20,7 @@ from jaxpose.experiments.slam.evaluation import (
     map_quality,
     tracking_numbers,
 )
-from jaxpose.experiments.slam.map_file import SavedMap, write_map
+from jaxpose.experiments.slam.map_file import write_map
 from jaxpose.experiments.slam.map_rendering import Renderer, renderer, views
 from jaxpose.experiments.slam.options import Options
 from jaxpose.experiments.slam.source import Source
@@ -30,7 +31,7 @@ from jaxpose.files.ply import write_ply
 from jaxpose.files.run_folder import give_back_memory
 from jaxpose.geometry.rigid import Similarity
 from jaxpose.plots import slam as slam_plots
-from jaxpose.slam import SlamResult
+from jaxpose.slam import SlamResult, saved_map
 from jaxpose.slam.initial_pose import first_pose
 from jaxpose.slam.keyframes import keyframe_images
 from jaxpose.slam.map.mesh import mesh, point_cloud
@@ -52,6 +53,8 @@ def write_run(
         What was measured, for the results, and the translation error [m] of every frame, NaN without ground
         truth.
     """
+    if options.map is not None:
+        source = _in_world_of_map(source, result)
     recording, ground_truth = source.recording, source.recording.T_world_cam
 
     def phase(name: str) -> None:
@@ -63,7 +66,7 @@ def write_run(
     measured = Measured(errors, inertial(recording, result), freedom(recording, result))
     _write_trajectory(folder, source, result)
     phase("writing the map")
-    write_map(folder / "map.npz", SavedMap(result.map_config, *result.scene_params, result.keyframes))
+    write_map(folder / "map.npz", saved_map(result))
     images_folder = "." if options.data is None else options.data.resolve()
     write_camera(
         folder / "camera.json",
@@ -75,7 +78,8 @@ def write_run(
     )
     atomic.write_json(folder / "config.json", options)
     phase("writing the point cloud and the mesh")
-    notes = (*recording.notes, *first_pose(recording).notes, *_coarser_notes(options, result))
+    world = first_pose(recording).notes if options.map is None else _map_notes(options.map, ground_truth)
+    notes = (*recording.notes, *world, *_coarser_notes(options, result))
     notes = (*notes, *_write_surface(folder, recording, result))
     phase("rendering the map")
     render = renderer(recording, result)
@@ -85,6 +89,24 @@ def write_run(
     calibration = {} if result.posterior is None else {"calibration": calibration_numbers(result.posterior)}
     found = {**tracking_numbers(result), **measured.numbers(), **calibration, "map": quality, "notes": notes}
     return found, np.full(len(recording.t), np.nan) if errors is None else errors.translation_m
+
+
+def _in_world_of_map(source: Source, result: SlamResult) -> Source:
+    """The recording with its true poses moved by SE(3) into the world of the map that was begun in."""
+    recording = source.recording
+    if (ground_truth := recording.T_world_cam) is not None:
+        known = np.isfinite(ground_truth).all(axis=(1, 2))
+        fit = trajectory_error.ate(ground_truth[known], result.T_world_cam[known]).alignment
+        recording = recording._replace(T_world_cam=trajectory_error.align(fit, ground_truth))
+    return source._replace(recording=recording, origin=np.zeros(3))
+
+
+def _map_notes(earlier: Path, ground_truth: Float[np.ndarray, "n 4 4"] | None) -> tuple[str, ...]:
+    """In which world a run is that has begun in the map of an earlier one."""
+    world = f"the world and the map are those of {earlier}, gone on with; points.ply is of this run alone"
+    if ground_truth is None:
+        return (world,)
+    return world, "the true poses are of another world: moved onto the estimate by SE(3)"
 
 
 def _coarser_notes(options: Options, result: SlamResult) -> tuple[str, ...]:
@@ -125,7 +147,8 @@ def _write_surface(folder: Path, recording: Recording, result: SlamResult) -> tu
     points = point_cloud(keyframes(), recording.camera, result.map_config.voxel)
     write_ply(folder / "points.ply", points.points, points.rgb)
     try:
-        surface = mesh(result.map_config, result.scene_params[0], keyframes(), recording.camera)
+        blocks, earlier = result.scene_params[0], result.earlier_blocks
+        surface = mesh(result.map_config, blocks, keyframes(), recording.camera, earlier)
     except ImportError:
         return ('no mesh.ply: pip install -e ".[mesh]" for marching cubes',)
     write_ply(folder / "mesh.ply", surface.points, surface.rgb, surface.faces)

@@ -6,12 +6,12 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 
 from jaxpose.datasets.types import Frame
 from jaxpose.errors import DataError
 from jaxpose.geometry import rigid
-from jaxpose.scenes.voxel_blocks import BlockConfig, Blocks, PoolFull
+from jaxpose.scenes.voxel_blocks import BlockConfig, Blocks, PoolFull, with_blocks
 from jaxpose.slam.keyframes import FrameReader
 from jaxpose.slam.map.backend import allocation_points, grow_to_fit, map_backend
 from jaxpose.slam.map.integrate import grown_map
@@ -48,8 +48,11 @@ def rebuilt(
         voxels are twice as wide.
     """
     assert state.map is not None
-    empty = MapState(_emptied(state.map.params), ())
-    return resumed(state._replace(map=empty, pending=chosen), read, at_once)
+    begun, earlier = _emptied(state.map.params), state.earlier
+    if earlier is not None:
+        assert isinstance(state.grid, BlockConfig)
+        begun = _refilled(with_blocks(state.grid, begun, earlier.coords.astype(np.int64)), earlier.values)
+    return resumed(state._replace(map=MapState(begun, ()), pending=chosen), read, at_once)
 
 
 def resumed(state: SlamState, read: FrameReader, count: int | None = None) -> SlamState:
@@ -112,6 +115,9 @@ def with_room(
 def _coarser(state: SlamState) -> SlamState:
     """The state with voxels twice as wide, which its map does not have yet."""
     assert isinstance(state.grid, BlockConfig)
+    if state.earlier is not None:
+        used = state.config.map_budget_gb
+        raise DataError(f"map_budget_gb: expected more, to go on in the map of an earlier run, got {used:g}")
     grid = BlockConfig(2 * state.grid.voxel, 2 * state.grid.truncation)
     return state._replace(grid=grid, coarser_at=np.append(state.coarser_at, state.frames.count - 1))
 
@@ -122,6 +128,12 @@ def _emptied(blocks: Blocks) -> Blocks:
     nothing = jax.tree.map(jnp.zeros_like, blocks)
     values = jnp.broadcast_to(blocks.values[:1], blocks.values.shape)
     return nothing._replace(corner=blocks.corner, count=jnp.ones_like(blocks.count), values=values)
+
+
+@partial(jax.jit, donate_argnums=0)
+def _refilled(blocks: Blocks, values: Int[Array, "n 9 9 9 8"]) -> Blocks:
+    """The blocks with the first rows as they were, in the same memory."""
+    return blocks._replace(values=blocks.values.at[1 : len(values) + 1].set(values))
 
 
 def posed(state: SlamState, frame: Frame, i: int) -> Posed:

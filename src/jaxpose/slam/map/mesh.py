@@ -65,20 +65,24 @@ def _joined(parts: list[tuple[np.ndarray, ...]]) -> tuple[np.ndarray, ...]:
     return _first_of_each(tuple(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
 
-def mesh(config: BlockConfig, blocks: Blocks, keyframes: Iterable[Keyframe], camera: Camera) -> Surface:
+def mesh(
+    config: BlockConfig, blocks: Blocks, keyframes: Iterable[Keyframe], camera: Camera, earlier: int = 0
+) -> Surface:
     """The zero of a map's signed distance by marching cubes, culled to what the keyframes have measured.
 
     A point lies between two nodes that were both measured: behind a surface, where measuring ends, distances
     change their sign too. It counts as seen where a keyframe has measured a depth within the map's truncation
-    of it. Needs scikit-image (extra `mesh`); ImportError without.
+    of it, or within the first blocks, `earlier` of them, which are of a run whose keyframes are not at hand.
+    Needs scikit-image (extra `mesh`); ImportError without.
     """
     from skimage.measure import marching_cubes
 
     coords, stored = packed(blocks)
-    corners, triangles, colours, known, count = (
+    corners, triangles, colours, known, before, count = (
         [np.zeros((0, 3))],
         [np.zeros((0, 3), np.int64)],
         [np.zeros((0, 3))],
+        [np.zeros(0, bool)],
         [np.zeros(0, bool)],
         0,
     )
@@ -91,19 +95,20 @@ def mesh(config: BlockConfig, blocks: Blocks, keyframes: Iterable[Keyframe], cam
         rgb = [map_coordinates(nodes[..., k], cells.T, order=1, mode="nearest") for k in (1, 2, 3)]
         ends = (tuple(end(cells).astype(int).T) for end in (np.floor, np.ceil))
         known.append(np.all([nodes[end][:, SAMPLED] > 0 for end in ends], axis=0))
+        before.append(np.full(len(cells), row < earlier))
         corners.append(CELLS * block + cells.astype(np.float64))
         colours.append(np.stack(rgb, axis=-1))
         triangles.append(faces + count)
         count += len(cells)
-    cells, rgb, known, faces = (np.concatenate(x) for x in (corners, colours, known, triangles))
+    cells, rgb, known, before, faces = map(np.concatenate, (corners, colours, known, before, triangles))
     # Blocks share their outer nodes, and so the corners between them.
     place = _cubes(cells - np.min(cells, axis=0, initial=np.inf), 1 / 64)
     _, first, which = np.unique(place, return_index=True, return_inverse=True)
-    cells, rgb, known = cells[first], rgb[first], known[first]
+    cells, rgb, known, before = cells[first], rgb[first], known[first], before[first]
     faces = np.asarray(which)[faces.astype(np.int64)]
     whole = (faces != np.roll(faces, 1, axis=1)).all(axis=1)  # no two corners have become one
     points = config.voxel * cells
-    measured = known & np.asarray(_seen(points, keyframes, camera, config.truncation))
+    measured = known & (before | _seen(points, keyframes, camera, config.truncation))
     kept = whole & measured[faces].all(axis=1)
     used, faces = np.unique(faces[kept], return_inverse=True)
     colour = np.round(255 * np.clip(rgb[used], 0, 1)).astype(np.uint8)

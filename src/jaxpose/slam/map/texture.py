@@ -82,6 +82,18 @@ def make_texture(
     return Texture(slot, tiles)
 
 
+def painted_over(earlier: Texture, texture: Texture) -> Texture:
+    """The texture, and beneath it that of an earlier run, whose blocks are the first of the same map."""
+    slot, tiles, beneath = texture.slot.copy(), texture.tiles.copy(), np.asarray(earlier.tiles)
+    rows = np.flatnonzero(earlier.slot)
+    both, alone = rows[slot[rows] > 0], rows[slot[rows] == 0]
+    for row in both:
+        tile = tiles[slot[row]]
+        tiles[slot[row]] = np.where(tile[..., 3:] > 0, tile, beneath[earlier.slot[row]])
+    slot[alone] = len(tiles) + np.arange(len(alone))
+    return Texture(slot, np.concatenate([tiles, beneath[earlier.slot[alone]]]))
+
+
 def _slices(count: int) -> list[slice]:
     """Nodes in turn, a few at a time."""
     return [slice(k, min(k + _TOGETHER, count)) for k in range(0, count, _TOGETHER)]
