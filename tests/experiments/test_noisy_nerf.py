@@ -290,6 +290,7 @@ def test_a_registration_is_read_as_it_was_written(tmp_path, far):
         registration.load(tmp_path / "registration.npz", 4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("noise_deg", "kept"), [(0.0, True), (3.0, False)])
 def test_stated_poses_stay_where_photographs_agree_with_them(noise_deg, kept):
     """Calibrated ones are not exchanged for poses by features; those of a rough guess are."""

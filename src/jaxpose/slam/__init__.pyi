@@ -2,6 +2,7 @@ from . import checkpoint as checkpoint
 from . import config as config
 from . import map as map
 from . import tracking as tracking
+from .beginning import init as init
 from .config import ImuMode as ImuMode
 from .config import LoopConfig as LoopConfig
 from .config import MapConfig as MapConfig
@@ -12,7 +13,6 @@ from .line_delay import estimate_line_delay as estimate_line_delay
 from .loops.types import Loops as Loops
 from .pipeline import Progress as Progress
 from .pipeline import finish as finish
-from .pipeline import init as init
 from .pipeline import run as run
 from .pipeline import step as step
 from .sessions import SavedMap as SavedMap

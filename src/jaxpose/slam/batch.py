@@ -102,6 +102,7 @@ def estimate_trajectory(state: SlamState, imu: Imu | None) -> tuple[Posterior | 
         noise=config.imu_noise,
         T_body_cam=state.T_body_cam,
         gravity_world=state.gravity_world,
+        offset_s=state.imu_offset_s,
     )
     if config.imu == "combined":
         posterior = estimated(drift=own, drift_s=SEEN_AGAIN_S)

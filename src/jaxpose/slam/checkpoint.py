@@ -16,14 +16,14 @@ from jaxpose.files.untrusted import read_npz, reading
 from jaxpose.imu import Imu
 from jaxpose.scenes import GridConfig
 from jaxpose.scenes.voxel_blocks import BlockConfig, packed, unpacked
+from jaxpose.slam.beginning import begin
 from jaxpose.slam.config import SlamConfig
 from jaxpose.slam.loops.types import no_loops
 from jaxpose.slam.map.backend import map_backend
-from jaxpose.slam.pipeline import begin
 from jaxpose.slam.tracking.features import detect
 from jaxpose.slam.types import SlamState, TrackingStatus, no_frames
 
-_NUMBERS = "max_depth", "duration_s", "settled"  # stored as arrays
+_NUMBERS = "max_depth", "duration_s", "settled", "imu_offset_s", "passes"  # stored as arrays
 _FASTEST = 1e6  # [m/s, rad/s, m]
 
 
@@ -79,6 +79,8 @@ def load(path: Path | str, recording: Recording, config: SlamConfig) -> SlamStat
         max_depth=float(state.max_depth),
         settled=int(state.settled),
         duration_s=float(state.duration_s),
+        imu_offset_s=float(state.imu_offset_s),
+        passes=int(state.passes),
     )
 
 
@@ -93,6 +95,9 @@ def _check(path: Path | str, state: SlamState) -> None:
     for name in ("twist", "velocity_body", "gyro_bias", "accelerometer_bias_world"):
         numbers(path, motion._asdict(), name, (None,), least=-_FASTEST, most=_FASTEST)
     numbers(path, state._asdict(), "max_depth", above=0, most=_FASTEST)
+    numbers(path, state._asdict(), "imu_offset_s", least=-_FASTEST, most=_FASTEST)
+    numbers(path, state._asdict(), "passes", whole=True, least=0, most=1)
+    rigid_transforms(path, "T_body_cam", state.T_body_cam[None])
     for name in ("coarser_at", "pending"):
         numbers(path, state._asdict(), name, (None,), whole=True, least=0, most=frames.count - 1)
     numbers(path, state._asdict(), "settled", whole=True, least=0, most=frames.count - 1)

@@ -11,22 +11,21 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 
 from jaxpose.datasets.types import Frame, Recording, check_frame
 from jaxpose.errors import DataError
 from jaxpose.geometry import rigid
 from jaxpose.geometry.camera import Camera, angle_of_view
-from jaxpose.imu import GRAVITY_WORLD, Gravity, Imu
+from jaxpose.imu import Imu
 from jaxpose.scenes.voxel_blocks import voxel_blocks
-from jaxpose.slam.batch import final_trajectory
+from jaxpose.slam.batch import FinalTrajectory, final_trajectory
+from jaxpose.slam.beginning import begin, begun_again, told_wrongly
 from jaxpose.slam.config import SlamConfig
-from jaxpose.slam.initial_pose import first_pose, upright_pose
+from jaxpose.slam.initial_pose import upright_pose
 from jaxpose.slam.keyframes import FrameReader, coarse_depth, keyframe_images, thumbnail
 from jaxpose.slam.loops.closure import with_loops
 from jaxpose.slam.loops.rebuild import EACH, resumed, with_room
 from jaxpose.slam.loops.refine import refined
-from jaxpose.slam.loops.types import no_loops
 from jaxpose.slam.map.backend import as_blocks, framed_field, is_mapped, map_frame, seen_points
 from jaxpose.slam.map.texture import make_texture, painted_over, textured
 from jaxpose.slam.observation import to_device
@@ -34,8 +33,7 @@ from jaxpose.slam.readings import all_readings, joined, readings_until
 from jaxpose.slam.tracker import expected_motion, next_pose, unrolled
 from jaxpose.slam.tracking.features import detect
 from jaxpose.slam.tracking.intrinsic_frame import is_due, make_refit, window
-from jaxpose.slam.tracking.predict import GYRO_BIAS_SIGMA
-from jaxpose.slam.types import Motion, SlamResult, SlamState, no_frames
+from jaxpose.slam.types import SlamResult, SlamState
 
 _DEFAULT = SlamConfig()
 
@@ -47,65 +45,6 @@ class Progress(NamedTuple):
     count: int
     state: SlamState  # valid until the next frame, which writes over its map
     ground_truth_error: float
-
-
-def init(
-    camera: Camera,
-    config: SlamConfig = _DEFAULT,
-    *,
-    T_world_cam: Float[np.ndarray, "4 4"] | None = None,
-    T_body_cam: Float[np.ndarray, "4 4"] | None = None,
-    gravity_world: Gravity = GRAVITY_WORLD,
-    duration_s: float | None = None,
-) -> SlamState:
-    """A SLAM run before its first frame.
-
-    Args:
-        camera: intrinsics of colour and depth, which are registered to each other.
-        config: settings of the run.
-        T_world_cam: pose of the first camera. By default the world is upright by the readings that come with
-            the first frame, or is the first camera's frame where there are none.
-        T_body_cam: camera to IMU; by default the IMU is where the camera is.
-        gravity_world: gravity [m/s^2] in the world.
-        duration_s: length of the sequence, which the paper's frames of reference (all but `anchored`) need.
-
-    Returns:
-        The state to call `step` with.
-
-    Raises:
-        ValueError: for a pose that is no rigid transform, or a frame of reference without a duration.
-    """
-    given = {"T_world_cam": T_world_cam, "T_body_cam": T_body_cam}
-    poses = {name: None if T is None else _rigid(name, T) for name, T in given.items()}
-    if config.uses_field and config.frame != "anchored" and duration_s is None:
-        raise ValueError(f"slam.init: frame {config.frame} expected duration_s [s] of the sequence, got None")
-    framed = framed_field(config)
-    return SlamState(
-        camera=camera,
-        config=config,
-        T_body_cam=np.eye(4) if poses["T_body_cam"] is None else poses["T_body_cam"],
-        gravity_world=np.asarray(gravity_world, np.float64),
-        T_world_cam_first=poses["T_world_cam"],
-        duration_s=np.nan if duration_s is None else float(duration_s),
-        frames=no_frames(np.zeros(0)),
-        imu=None,
-        motion=Motion(np.zeros(6), np.zeros(3), np.zeros(3), GYRO_BIAS_SIGMA, np.zeros(3)),
-        params=None if framed is None else jax.jit(framed.field.init)(jax.random.key(config.seed)),
-        exposure=np.ones(3, np.float32),
-        max_depth=0.0,
-        thumbnails=np.zeros((0, 2, 12, 16)),
-        keyframe_depths=np.zeros((0, 12, 16)),
-        features=None,
-        keyframe_features=(),
-        loops=no_loops(),
-        settled=0,
-        pending=np.zeros(0, int),
-        coarser_at=np.zeros(0, int),
-        images=(),
-        readings=(),
-        grid=None,
-        map=None,
-    )
 
 
 def step(
@@ -166,7 +105,7 @@ def finish(state: SlamState) -> SlamResult:
     read = lambda i: _kept_image(state, i)
     copied = lambda: state._replace(map=jax.tree.map(jnp.copy, state.map))
     whole = resumed(copied(), read) if len(state.pending) else state
-    return _finish(whole, read, all_readings(state.readings))
+    return _summed_up(whole, read, _final(whole, all_readings(state.readings)))
 
 
 def run(
@@ -178,7 +117,9 @@ def run(
 ) -> SlamResult:
     """Track every frame of an RGB-D recording and map what it sees (Ma et al. 2024, section 3.4).
 
-    At its end frames in doubt are registered once more, to the map of all of them (`config.refine`).
+    At its end frames in doubt are registered once more, to the map of all of them (`config.refine`). Where
+    clock or mounting of the IMU are estimated and were told wrongly, all is tracked again with what was
+    found.
 
     Args:
         recording: frames with times, and what is known beside them. The world's frame is that of its first
@@ -195,7 +136,10 @@ def run(
     state = track_all(recording, config, on_frame, state)
     if config.uses_refinement:
         state = refined(state, recording.read, on_refined)
-    return _finish(state, recording.read, recording.imu)
+    found = _final(state, recording.imu)
+    if found.posterior is not None and not state.passes and told_wrongly(state, found.posterior):
+        return run(recording, config, on_frame, begun_again(state, found.posterior), on_refined)
+    return _summed_up(state, recording.read, found)
 
 
 def track_all(
@@ -206,9 +150,12 @@ def track_all(
 ) -> SlamState:
     """Track and map every frame: `run` without its end, with the same arguments and errors."""
     state = state or begin(recording, config)
+    imu = recording.imu
+    if imu is not None:
+        imu = imu._replace(t=np.asarray(imu.t) - state.imu_offset_s)
     for i in range(state.frames.count, len(recording.t)):
         started, t = time.perf_counter(), float(recording.t[i])
-        readings = readings_until(recording.imu, state.frames.t[-1] if i else -np.inf, t)
+        readings = readings_until(imu, state.frames.t[-1] if i else -np.inf, t)
         try:
             frame = check_frame(recording.read(i), recording.camera)
         except ValueError as error:
@@ -222,32 +169,6 @@ def track_all(
         if on_frame is not None:
             on_frame(Progress(i, len(recording.t), state, _ground_truth_error(recording, state)))
     return resumed(state, recording.read)
-
-
-def begin(recording: Recording, config: SlamConfig = _DEFAULT) -> SlamState:
-    """The state of a recording's run before its first frame; DataError as `run` says."""
-    t = recording.t
-    if len(t) < 2:
-        raise DataError(f"{recording.name}: expected at least 2 frames, got {len(t)}")
-    if config.uses_gyroscope:
-        if recording.imu is None:
-            raise DataError(
-                f"{recording.name}: --imu {config.imu} needs inertial readings, and there are none"
-            )
-        first, last = (float(recording.imu.t[k]) for k in (0, -1))
-        if last < t[0] or first > t[-1]:
-            raise DataError(
-                f"{recording.name}: expected inertial readings between {t[0]:.3f} and {t[-1]:.3f} s (the "
-                f"frames), got them between {first:.3f} and {last:.3f} s"
-            )
-    return init(
-        recording.camera,
-        config,
-        T_world_cam=first_pose(recording).T_world_cam,
-        T_body_cam=recording.T_body_cam,
-        gravity_world=recording.gravity_world,
-        duration_s=float(t[-1] - t[0]),
-    )
 
 
 def _advance(state: SlamState, frame: Frame, t: float, imu: Imu | None, read: FrameReader) -> SlamState:
@@ -321,13 +242,18 @@ def _refit(camera: Camera, config: SlamConfig):
     return make_refit(*framed.parts, angle_of_view(camera)[0])
 
 
-def _finish(state: SlamState, read: FrameReader, imu: Imu | None) -> SlamResult:
-    """One continuous trajectory, by all readings or else through all poses, and the map with its texture."""
+def _final(state: SlamState, imu: Imu | None) -> FinalTrajectory:
+    """One continuous trajectory, by all readings or else through all poses."""
     if (count := state.frames.count) < 2:
         raise DataError(f"SLAM: expected at least 2 frames, got {count}")
-    if state.config.frame == "intrinsic" and not is_due(count - 1):
+    return final_trajectory(state, imu)
+
+
+def _summed_up(state: SlamState, read: FrameReader, found: FinalTrajectory) -> SlamResult:
+    """The run with its trajectory, and with the texture of its map."""
+    if state.config.frame == "intrinsic" and not is_due(state.frames.count - 1):
         state = _update_intrinsic_frame(state)
-    frames, found = state.frames, final_trajectory(state, imu)
+    frames = state.frames
     tracked = frames.T_world_body @ state.T_body_cam
     config, blocks = as_blocks(state)
     keyframes = keyframe_images(read, np.flatnonzero(frames.keyframe), tracked)
@@ -340,6 +266,7 @@ def _finish(state: SlamState, read: FrameReader, imu: Imu | None) -> SlamResult:
         loops=state.loops,
         coarser_at=state.coarser_at,
         keyframe_features=state.keyframe_features,
+        T_body_cam=state.T_body_cam,
         earlier_blocks=0 if state.earlier is None else len(state.earlier.coords),
         scene=textured(voxel_blocks(config), config),
         map_config=config,
@@ -362,17 +289,9 @@ def _checked(state: SlamState, rgb: np.ndarray, depth: np.ndarray, t: float) -> 
     return frame
 
 
-def _rigid(name: str, T: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-    T = np.asarray(T, np.float64)
-    good = T.shape == (4, 4) and np.isfinite(T).all() and np.allclose(T[3], [0, 0, 0, 1])
-    if not good or not rigid.is_rotation(T[:3, :3], tolerance=1e-3):
-        raise ValueError(f"slam.init: expected {name} to be a rigid transform (4, 4), got {T.tolist()}")
-    return T
-
-
 def _ground_truth_error(recording: Recording, state: SlamState) -> float:
     if recording.T_world_cam is None:
         return float("nan")
-    estimate, i = state.frames.T_world_body @ recording.T_body_cam, state.frames.count - 1
+    estimate, i = state.frames.T_world_body @ state.T_body_cam, state.frames.count - 1
     put_together = recording.T_world_cam[0] @ rigid.inverse(estimate[0]) @ estimate[i]
     return float(np.linalg.norm(recording.T_world_cam[i, :3, 3] - put_together[:3, 3]))

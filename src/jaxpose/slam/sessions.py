@@ -12,13 +12,13 @@ from jaxpose.datasets.types import Frame, Recording, check_frame
 from jaxpose.errors import DataError
 from jaxpose.geometry.camera import Camera
 from jaxpose.scenes.voxel_blocks import BlockConfig, Blocks, packed
+from jaxpose.slam.beginning import begin
 from jaxpose.slam.config import RecoveryConfig, SlamConfig, TrackConfig
 from jaxpose.slam.initial_pose import first_force, is_gravity
 from jaxpose.slam.map.integrate import sample_map
 from jaxpose.slam.map.photometric import MapState
 from jaxpose.slam.map.texture import Texture
 from jaxpose.slam.observation import Image, sample_pixels, to_device
-from jaxpose.slam.pipeline import begin
 from jaxpose.slam.tracking.features import FeaturePose, Features, detect, locate_camera
 from jaxpose.slam.tracking.predict import FIRST_FEATURE_SCALE
 from jaxpose.slam.tracking.register import register

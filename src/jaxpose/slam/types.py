@@ -170,6 +170,8 @@ class SlamState(NamedTuple):
     gravity_world: Float[np.ndarray, "3"]  # [m/s^2]
     T_world_cam_first: Float[np.ndarray, "4 4"] | None  # None: upright by the first readings
     duration_s: float  # of the sequence, for the paper's frames of reference; NaN: not known
+    imu_offset_s: float  # t_imu - t_frame by an earlier pass over the same frames, as is T_body_cam
+    passes: int  # over these frames before
     frames: Frames
     imu: Imu | None  # readings since a little before the last frame
     motion: Motion
@@ -200,6 +202,7 @@ class SlamResult(NamedTuple):
     loops: Loops
     coarser_at: Int[np.ndarray, " c"]  # frames at which voxels became twice as wide (`config.map_budget_gb`)
     keyframe_features: tuple[Features, ...]  # by which a later run finds where it is
+    T_body_cam: Float[np.ndarray, "4 4"]  # the camera on the IMU, as tracking had it
     earlier_blocks: int  # of the map, the first ones: what an earlier run has made (`sessions.begin_in`)
     scene: SceneField
     map_config: BlockConfig

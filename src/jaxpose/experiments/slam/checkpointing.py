@@ -51,7 +51,7 @@ def _preview(path: Path, recording: Recording, state: SlamState) -> None:
     """The path so far, and the last frame beside the map."""
     frames, i = state.frames, state.frames.count - 1
     assert state.grid is not None and state.map is not None
-    T_world_cam = frames.T_world_body[: i + 1] @ recording.T_body_cam
+    T_world_cam = frames.T_world_body[: i + 1] @ state.T_body_cam
     frame, params = recording.read(i), scene_params(state.map)
     if isinstance(state.grid, BlockConfig):
         box = bounds(state.grid, params)

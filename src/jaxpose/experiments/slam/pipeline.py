@@ -137,7 +137,7 @@ def _single(
 
     def on_frame(progress: Progress) -> None:
         keep(progress)
-        on_update(tracking_update(mode, progress))
+        on_update(tracking_update(mode + ", second pass" * progress.state.passes, progress))
         if progress.index < _COMPILING or progress.index == progress.count - 1:
             run_folder.give_back_memory()
         if progress.index == progress.count - 1:

@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from jaxpose.datasets.origin import moved
 from jaxpose.datasets.types import Recording
+from jaxpose.estimate import Sensors
 from jaxpose.evaluation import trajectory_error
 from jaxpose.experiments.progress import OnUpdate, Update
 from jaxpose.experiments.slam.calibration import calibration_numbers
@@ -55,6 +56,8 @@ def write_run(
     """
     if options.map is not None:
         source = _in_world_of_map(source, result)
+    if result.posterior is not None:
+        source = source._replace(recording=_as_estimated(source.recording, result.posterior.sensors))
     recording, ground_truth = source.recording, source.recording.T_world_cam
 
     def phase(name: str) -> None:
@@ -89,6 +92,12 @@ def write_run(
     calibration = {} if result.posterior is None else {"calibration": calibration_numbers(result.posterior)}
     found = {**tracking_numbers(result), **measured.numbers(), **calibration, "map": quality, "notes": notes}
     return found, np.full(len(recording.t), np.nan) if errors is None else errors.translation_m
+
+
+def _as_estimated(recording: Recording, found: Sensors) -> Recording:
+    """The recording with the IMU where and when it was found to be; the same where neither was estimated."""
+    imu = recording.imu and recording.imu._replace(t=np.asarray(recording.imu.t) - found.offset_s)
+    return recording._replace(imu=imu, T_body_cam=found.T_body_cam)
 
 
 def _in_world_of_map(source: Source, result: SlamResult) -> Source:
