@@ -6,6 +6,7 @@ import re
 import zipfile
 import zlib
 from collections.abc import Callable
+from copy import deepcopy
 from random import Random
 from typing import Any
 
@@ -108,12 +109,12 @@ def tree(random: Random, content: bytes) -> bytes:
             case 0:
                 del node[key]
             case 1 if isinstance(node, list):
-                node[key:key] = [node[key]] * random.choice((1, 30))
+                node[key:key] = deepcopy([node[key]] * random.choice((1, 30)))
             case 2:
                 other, place = random.choice(places)
                 node[key] = json.loads(json.dumps(other[place])) if _there(other, place) else None
             case _:
-                node[key] = random.choice(VALUES)
+                node[key] = deepcopy(random.choice(VALUES))  # a case changes none of another
     try:
         found = json.dumps(value)
     except (ValueError, RecursionError):

@@ -58,8 +58,9 @@ def fault_of(target: Any, folder: Path) -> str | None:
         bad = [array for array in numbers_of(found) if not np.isfinite(array).all()]
         fault = "not finite" if bad else None
     except (DataError, OSError) as error:
-        # FFmpeg says that memory is lacking, with an error of the system's, for sizes that no file has.
-        big = isinstance(error.__context__, MemoryError) and not isinstance(error.__context__, OSError)
+        # FFmpeg says that memory is lacking for sizes that no file has: it asks the system before it reads.
+        cause = error.__context__
+        big = isinstance(cause, MemoryError) and not type(cause).__module__.startswith("av.")
         fault = "memory" if big else "not one line" if "\n" in str(error) or len(str(error)) > 1500 else None
         if isinstance(error, OSError) and error.errno is None:
             fault = f"{type(error).__name__} without a file: {str(error)[:80]}"

@@ -387,6 +387,19 @@ def test_images_that_cannot_be_decoded_are_named(tmp_path, walk):
         recording.read(3)
 
 
+@pytest.mark.parametrize("topic", [COLOR, DEPTH])
+def test_a_size_that_the_bytes_do_not_have_is_refused_before_it_is_used(walk, tmp_path, topic):
+    make = Maker("ros1")
+    rows = messages(make, walk)
+    for row in rows:
+        if row.topic == topic:
+            row.content.width, row.content.height = 2**25, 16
+    with pytest.raises(
+        DataError, match=f"{topic}: expected 33554432x16 pixels of .*, got .* bytes in rows of"
+    ):
+        ros.load(make.write(tmp_path, rows))
+
+
 def test_without_the_package_the_extra_is_named(tmp_path, walk, monkeypatch):
     make = Maker("ros1")
     path = make.write(tmp_path, messages(make, walk))

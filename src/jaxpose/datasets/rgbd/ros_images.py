@@ -47,13 +47,15 @@ def image_kind(message: Any) -> ImageKind | None:
         Its kind.
 
     Raises:
-        ValueError: For a compressed image that cannot be decoded.
+        ValueError: For a compressed image that cannot be decoded, and for too few bytes.
     """
     if hasattr(message, "encoding"):
         size = (int(message.width), int(message.height))
         if message.encoding in _DEPTHS:
+            _row_bytes(message, np.dtype(_DEPTHS[message.encoding]), 1)
             return ImageKind("depth", message.encoding, size)
         if message.encoding in _COLORS:
+            _row_bytes(message, np.dtype(np.uint8), _COLORS[message.encoding][0])
             role = "grey" if message.encoding in _GREY else "color"
             return ImageKind(role, message.encoding, size)
         return None
@@ -142,14 +144,20 @@ def _metres(counts: np.ndarray) -> np.ndarray:
 def _pixels(message: Any, dtype: np.dtype, channels: int) -> np.ndarray:
     """(height, width[, channels]) of a raw message, whose rows may be padded."""
     height, width, step = int(message.height), int(message.width), int(message.step)
-    data = np.asarray(message.data, np.uint8)
-    row = width * channels * dtype.itemsize
-    if step < row or len(data) < step * height:
-        raise ValueError(
-            f"expected {width}x{height} pixels of {message.encoding}, got {len(data)} bytes in rows of {step}"
-        )
+    data, row = np.asarray(message.data, np.uint8), _row_bytes(message, dtype, channels)
     rows = np.ascontiguousarray(data[: step * height].reshape(height, step)[:, :row])
     return rows.view(dtype).reshape((height, width, channels) if channels > 1 else (height, width))
+
+
+def _row_bytes(message: Any, dtype: np.dtype, channels: int) -> int:
+    """The bytes of a row without its padding; ValueError for a raw message with fewer than its rows have."""
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    row, there = width * channels * dtype.itemsize, len(message.data)
+    if step < row or there < step * height:
+        raise ValueError(
+            f"expected {width}x{height} pixels of {message.encoding}, got {there} bytes in rows of {step}"
+        )
+    return row
 
 
 def _converted(pixels: np.ndarray, conversion: str | None) -> np.ndarray:
