@@ -156,7 +156,9 @@ def begun_again(state: SlamState, found: Posterior) -> SlamState:
         return again
     assert isinstance(state.grid, BlockConfig)
     begun = MapState(unpacked(state.grid, earlier.coords, earlier.values), ())
-    return again._replace(grid=state.grid, map=begun, earlier=earlier, exposure=state.frames.exposure[0])
+    return again._replace(
+        grid=state.grid, map=begun, earlier=earlier, exposure=np.float32(state.frames.exposure[0])
+    )
 
 
 def _rigid(name: str, T: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:

@@ -267,7 +267,7 @@ def _summed_up(state: SlamState, read: FrameReader, found: FinalTrajectory) -> S
         coarser_at=state.coarser_at,
         keyframe_features=state.keyframe_features,
         T_body_cam=state.T_body_cam,
-        earlier_blocks=0 if state.earlier is None else len(state.earlier.coords),
+        earlier=state.earlier,
         scene=textured(voxel_blocks(config), config),
         map_config=config,
         scene_params=(blocks, jax.tree.map(jnp.asarray, texture)),

@@ -36,8 +36,8 @@ class SavedMap(NamedTuple):
         blocks: the map, with the weights that it was integrated with.
         texture: finer colour on its surface.
         keyframes: which frames of the run are (k,).
-        T_world_cam: poses of the keyframes (k, 4, 4).
-        features: of the keyframes, k of them; none of a run without.
+        T_world_cam: poses of keyframes (m, 4, 4), of runs before in the same map first.
+        features: of these keyframes, m of them; none of a run without.
         usual: median loss [sigmas] and colour error of the run's frames.
     """
 
@@ -45,7 +45,7 @@ class SavedMap(NamedTuple):
     blocks: Blocks
     texture: Texture
     keyframes: Int[np.ndarray, " k"]
-    T_world_cam: Float[np.ndarray, "k 4 4"]
+    T_world_cam: Float[np.ndarray, "m 4 4"]
     features: tuple[Features, ...]
     usual: tuple[float, float]
 
@@ -72,12 +72,16 @@ def saved_map(result: SlamResult) -> SavedMap:
     frames, kept = result.frames, result.keyframes
     found = ~frames.doubted & np.isfinite(frames.loss)
     usual = [float(np.median(x[found])) if found.any() else 0.0 for x in (frames.loss, frames.colour_error)]
+    poses, features = result.T_world_cam[kept], result.keyframe_features
+    if result.earlier is not None:
+        poses = np.concatenate([result.earlier.T_world_cam, poses])
+        features = (*result.earlier.features, *features)
     return SavedMap(
         result.map_config,
         *result.scene_params,
         keyframes=kept,
-        T_world_cam=result.T_world_cam[kept],
-        features=result.keyframe_features,
+        T_world_cam=poses,
+        features=features,
         usual=(usual[0], usual[1]),
     )
 
@@ -111,7 +115,9 @@ def begin_in(earlier: SavedMap, recording: Recording, config: SlamConfig) -> Sla
     if found is None:
         places = np.unique(np.linspace(0, len(recording.t) - 1, _HINTS + 1).astype(int))[1:]
         later = next((i for i in places.tolist() if find(i) is not None), None)
-        hint = "nor do others" if later is None else f"but frame {later} does: --start skips frames"
+        hint = "nor do others"
+        if later is not None:
+            hint = f"but the one {recording.t[later] - recording.t[0]:.2f} s later does: --start skips frames"
         raise DataError(
             f"{recording.name}: expected a first frame that shows what the map holds, it does not, {hint}"
         )
@@ -136,7 +142,8 @@ def with_earlier(state: SlamState, earlier: SavedMap) -> SlamState:
         The state; a map that is made anew begins with the earlier one.
     """
     coords, values = (np.array(x) for x in packed(earlier.blocks))
-    return state._replace(earlier=EarlierMap(coords, values, earlier.texture))
+    known = EarlierMap(coords, values, earlier.texture, earlier.T_world_cam, earlier.features)
+    return state._replace(earlier=known)
 
 
 def _found(earlier: SavedMap, recording: Recording, config: SlamConfig, index: int) -> _Found | None:

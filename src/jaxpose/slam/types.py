@@ -155,6 +155,8 @@ class EarlierMap(NamedTuple):
     coords: Int[np.ndarray, "n 3"]  # `voxel_blocks.packed`
     values: Int[np.ndarray, "n 9 9 9 8"]
     texture: Texture
+    T_world_cam: Float[np.ndarray, "m 4 4"]  # of its keyframes, and of those of runs before it
+    features: tuple[Features, ...]
 
 
 class SlamState(NamedTuple):
@@ -203,7 +205,7 @@ class SlamResult(NamedTuple):
     coarser_at: Int[np.ndarray, " c"]  # frames at which voxels became twice as wide (`config.map_budget_gb`)
     keyframe_features: tuple[Features, ...]  # by which a later run finds where it is
     T_body_cam: Float[np.ndarray, "4 4"]  # the camera on the IMU, as tracking had it
-    earlier_blocks: int  # of the map, the first ones: what an earlier run has made (`sessions.begin_in`)
+    earlier: EarlierMap | None  # which the first blocks of the map are of (`sessions.begin_in`)
     scene: SceneField
     map_config: BlockConfig
     scene_params: tuple[Blocks, Texture]

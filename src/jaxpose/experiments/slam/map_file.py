@@ -128,10 +128,10 @@ def read_map(path: Path | str) -> SavedMap:
     slot = np.zeros(blocks.coords.shape[0], np.int32)
     slot[1 : count + 1] = number("texture_slot", (count,), whole=True, least=0, most=len(tiles) - 1)
     keyframes = number("keyframes", (None,), whole=True, least=0)
-    T_world_cam = number("keyframe_T_world_cam", (len(keyframes), 4, 4))
+    T_world_cam = number("keyframe_T_world_cam", (None, 4, 4))
     rigid_transforms(path, "keyframe_T_world_cam", T_world_cam)
     loss, colour = number("usual", (2,), least=0, most=_MOST_LOSS).tolist()
-    features = _features(path, content, len(keyframes))
+    features = _features(path, content, len(T_world_cam))
     return SavedMap(config, blocks, Texture(slot, tiles), keyframes, T_world_cam, features, (loss, colour))
 
 

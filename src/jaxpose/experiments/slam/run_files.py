@@ -156,7 +156,7 @@ def _write_surface(folder: Path, recording: Recording, result: SlamResult) -> tu
     points = point_cloud(keyframes(), recording.camera, result.map_config.voxel)
     write_ply(folder / "points.ply", points.points, points.rgb)
     try:
-        blocks, earlier = result.scene_params[0], result.earlier_blocks
+        blocks, earlier = result.scene_params[0], 0 if result.earlier is None else len(result.earlier.coords)
         surface = mesh(result.map_config, blocks, keyframes(), recording.camera, earlier)
     except ImportError:
         return ('no mesh.ply: pip install -e ".[mesh]" for marching cubes',)
