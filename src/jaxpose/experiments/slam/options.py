@@ -27,7 +27,7 @@ FEWEST_FRAMES = 3  # three camera centres are the fewest that an alignment can b
 # The options of the first screen of help.
 GROUPS = {
     "data": ("data", "recorded_hz", "rate_hz", "imu_file", "imu_extrinsics", "map"),
-    "method": ("slam.imu", "compare", "slam.voxel", "slam.map_budget_gb", "slam.seed"),
+    "method": ("slam.imu", "compare", "slam.voxel", "slam.seed"),
     "run": ("out", "name", "resume", "smoke", "json"),
 }
 # What tracking sets by itself, or cannot use.
