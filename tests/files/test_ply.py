@@ -94,6 +94,15 @@ def test_coloured_points_that_are_not_all_there(tmp_path, count):
         read_coloured_points(tmp_path / "a.ply")
 
 
+@pytest.mark.parametrize("axis", "xyz")
+def test_coloured_points_without_an_axis_are_named(tmp_path, axis):
+    write_ply(tmp_path / "a.ply", POINTS, np.zeros((3, 3), np.uint8))
+    content = (tmp_path / "a.ply").read_bytes()
+    (tmp_path / "a.ply").write_bytes(content.replace(b"float " + axis.encode(), b"float w"))
+    with pytest.raises(DataError, match=f"a.ply: expected vertices with x y z, got no {axis}"):
+        read_coloured_points(tmp_path / "a.ply")
+
+
 def test_a_point_without_a_place_stays_nan(tmp_path):
     (tmp_path / "a.ply").write_bytes(TEXT + b"7 1 nan 3 4\n7 1 2 3 4\n7 1 inf 3 4\n")
     points = read_points(tmp_path / "a.ply")

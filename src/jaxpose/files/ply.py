@@ -38,11 +38,14 @@ def read_coloured_points(path: Path | str) -> tuple[Float[np.ndarray, "n 3"], UI
     with path.open("rb") as stream, reading(path, "a PLY file"):
         form, count, properties, _ = _header(path, stream)
         wanted = dict.fromkeys(("red", "green", "blue"), "u1")
-        if form == "ascii" or any(dict(properties).get(name) != code for name, code in wanted.items()):
+        found = dict(properties)
+        if form == "ascii" or any(found.get(name) != code for name, code in wanted.items()):
             raise DataError(f"{path}: expected binary vertices with red green blue of 8 bits, got others")
+        if missing := [axis for axis in "xyz" if axis not in found]:
+            raise DataError(f"{path}: expected vertices with x y z, got no {' '.join(missing)}")
         vertices = _vertices(path, stream, form, count, properties)
-    points = np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
-    return points, np.stack([vertices[name] for name in wanted], axis=1)
+        points = np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
+        return _near(path, points), np.stack([vertices[name] for name in wanted], axis=1)
 
 
 def read_points(path: Path | str) -> Float[np.ndarray, "n 3"]:
