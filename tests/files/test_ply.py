@@ -85,6 +85,11 @@ def test_damaged_files_are_named(tmp_path, content, message):
     assert "\n" not in str(error.value)
 
 
+def test_lines_without_anything_are_passed_over(tmp_path):
+    (tmp_path / "a.ply").write_bytes(TEXT + b"\n7 1 2 3 4\n \n7 5 6 7 8\n\r\n7 9 8 7 6\n3 0 1 2\n")
+    np.testing.assert_array_equal(read_points(tmp_path / "a.ply"), [[1, 2, 4], [5, 6, 8], [9, 8, 6]])
+
+
 @pytest.mark.parametrize("count", [b"4", b"9999999999999"])
 def test_coloured_points_that_are_not_all_there(tmp_path, count):
     write_ply(tmp_path / "a.ply", POINTS, np.zeros((3, 3), np.uint8))

@@ -4,9 +4,9 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
-from scipy.stats import chi2
+from scipy.special import chdtri
 
-_USUAL = 0.99  # share of squared distances below which rows count by their squares
+_UNUSUAL = 0.01  # share of squared distances from which on rows count by their size
 
 
 class Rows(NamedTuple):
@@ -33,4 +33,4 @@ def robust_cost(rows: Rows) -> Float[Array, ""]:
 
 
 def _usual_square(r: Float[Array, "n m"]) -> float:
-    return float(chi2.ppf(_USUAL, r.shape[-1]))
+    return float(chdtri(r.shape[-1], _UNUSUAL))  # of chi^2

@@ -177,7 +177,9 @@ def _text(
     path: Path, stream: BinaryIO, count: int, columns: list[int], above: int
 ) -> Float[np.ndarray, "n 3"]:
     try:
-        points = np.loadtxt(islice(stream, count), np.float64, usecols=columns, ndmin=2, comments=None)
+        points = np.loadtxt(
+            islice(filter(bytes.strip, stream), count), np.float64, usecols=columns, ndmin=2, comments=None
+        )
     except ValueError as error:
         raise DataError(
             f"{path}: expected {count} lines of numbers below line {above}, got {error}"

@@ -292,6 +292,7 @@ def _checked(state: SlamState, rgb: np.ndarray, depth: np.ndarray, t: float) -> 
 def _ground_truth_error(recording: Recording, state: SlamState) -> float:
     if recording.T_world_cam is None:
         return float("nan")
-    estimate, i = state.frames.T_world_body @ state.T_body_cam, state.frames.count - 1
-    put_together = recording.T_world_cam[0] @ rigid.inverse(estimate[0]) @ estimate[i]
+    i = state.frames.count - 1
+    first, now = state.frames.T_world_body[[0, i]] @ state.T_body_cam
+    put_together = recording.T_world_cam[0] @ rigid.inverse(first) @ now
     return float(np.linalg.norm(recording.T_world_cam[i, :3, 3] - put_together[:3, 3]))

@@ -110,21 +110,12 @@ def read_map(path: Path | str) -> SavedMap:
         raise DataError(f"{path}: coords: expected blocks beside each other, got {reach} of {count} away")
     nodes = (count, NODES, NODES, NODES)
     number("values", (*nodes, _VALUES), least=-_LARGEST_M, most=_LARGEST_M)
-    fusion = content.get("fusion")
-    if fusion is None or fusion.dtype != np.int16 or fusion.shape != (*nodes, CHANNELS - _VALUES):
-        got = "none" if fusion is None else f"{fusion.dtype} of shape {fusion.shape}"
-        raise DataError(f"{path}: fusion: expected int16 of {CHANNELS - _VALUES} for each node, got {got}")
+    rest = CHANNELS - _VALUES
+    fusion = _whole(path, content, "fusion", np.int16, (*nodes, rest), f"int16 of {rest} for each node")
     stored = of_distance_and_colour(config, content["values"])[..., :_VALUES]
     blocks = unpacked(config, coords, np.concatenate([stored, fusion], axis=-1))
-    tiles = content.get("texture_tiles")
-    if (
-        tiles is None
-        or tiles.dtype != np.uint8
-        or tiles.ndim != 5
-        or tiles.shape[1:] != (SIDE, SIDE, SIDE, 4)
-    ):
-        got = "none" if tiles is None else f"{tiles.dtype} of shape {tiles.shape}"
-        raise DataError(f"{path}: texture_tiles: expected uint8 of n tiles of {SIDE}^3 x 4, got {got}")
+    cube = (None, SIDE, SIDE, SIDE, 4)
+    tiles = _whole(path, content, "texture_tiles", np.uint8, cube, f"uint8 of n tiles of {SIDE}^3 x 4")
     slot = np.zeros(blocks.coords.shape[0], np.int32)
     slot[1 : count + 1] = number("texture_slot", (count,), whole=True, least=0, most=len(tiles) - 1)
     keyframes = number("keyframes", (None,), whole=True, least=0)
@@ -135,14 +126,28 @@ def read_map(path: Path | str) -> SavedMap:
     return SavedMap(config, blocks, Texture(slot, tiles), keyframes, T_world_cam, features, (loss, colour))
 
 
+def _whole(
+    path: Path | str, content: Any, key: str, kind: type, shape: tuple[int | None, ...], wanted: str
+) -> np.ndarray:
+    """An array of just this type and shape, None for any size; DataError that says what was `wanted`."""
+    x = content.get(key)
+    if (
+        x is None
+        or x.dtype != kind
+        or x.ndim != len(shape)
+        or any(size not in (None, found) for size, found in zip(shape, x.shape, strict=True))
+    ):
+        got = "none" if x is None else f"{x.dtype} of shape {x.shape}"
+        raise DataError(f"{path}: {key}: expected {wanted}, got {got}")
+    return x
+
+
 def _features(path: Path | str, content: Any, keyframes: int) -> tuple[Features, ...]:
     """The features of each keyframe; none of a run without."""
     number = partial(numbers, path, content)
     counts = number("feature_count", (None,), whole=True, least=0)
-    descriptor = content.get("feature_descriptor")
-    if descriptor is None or descriptor.dtype != np.uint8 or descriptor.shape[1:] != (_DESCRIPTOR,):
-        got = "none" if descriptor is None else f"{descriptor.dtype} of shape {descriptor.shape}"
-        raise DataError(f"{path}: feature_descriptor: expected uint8 (n, {_DESCRIPTOR}), got {got}")
+    shape, wanted = (None, _DESCRIPTOR), f"uint8 (n, {_DESCRIPTOR})"
+    descriptor = _whole(path, content, "feature_descriptor", np.uint8, shape, wanted)
     total = len(descriptor)
     if len(counts) not in (0, keyframes) or counts.sum() != total:
         wanted = f"{keyframes} that sum up to {total}"

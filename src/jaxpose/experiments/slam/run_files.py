@@ -104,8 +104,7 @@ def _in_world_of_map(source: Source, result: SlamResult) -> Source:
     """The recording with its true poses moved by SE(3) into the world of the map that was begun in."""
     recording = source.recording
     if (ground_truth := recording.T_world_cam) is not None:
-        known = np.isfinite(ground_truth).all(axis=(1, 2))
-        fit = trajectory_error.ate(ground_truth[known], result.T_world_cam[known]).alignment
+        fit = trajectory_error.ate(ground_truth, result.T_world_cam).alignment
         recording = recording._replace(T_world_cam=trajectory_error.align(fit, ground_truth))
     return source._replace(recording=recording, origin=np.zeros(3))
 
