@@ -1,11 +1,13 @@
 """Fixtures: both precisions, strict dtypes, the data folder."""
 
+import gc
 import os
+import re
 import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
-if "PYTEST_XDIST_WORKER" not in os.environ:
+if "PYTEST_XDIST_WORKER" not in os.environ and "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     # What is compiled is shared by workers and the commands they start; nothing is left for the next run.
     _compiled = tempfile.TemporaryDirectory(prefix="jaxpose-compiled-")
     os.environ["JAX_COMPILATION_CACHE_DIR"] = _compiled.name
@@ -38,6 +40,14 @@ def pytest_runtest_setup(item):
     compile_quickly(not any(item.get_closest_marker(name) for name in ("optimised", "slow")))
 
 
+@pytest.fixture(scope="module", autouse=True)
+def settled_heap():
+    """What is alive after a module, compiled functions above all, is not looked through for garbage again."""
+    yield
+    gc.collect()
+    gc.freeze()
+
+
 @pytest.fixture(params=["float32", "float64"])
 def dtype(request):
     """Run the test in float32 and, with 64-bit types enabled, in float64."""
@@ -54,6 +64,20 @@ def unchecked():
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
     jaxtyping.config.update("jaxtyping_disable", False)
+
+
+@pytest.fixture
+def compiled(caplog):
+    """Names of the functions that any thread has compiled since the last time it was asked."""
+
+    def names():
+        found = set(re.findall(r"XLA compilation of jit\((\w+)\)", caplog.text))
+        caplog.clear()
+        return found
+
+    jax.config.update("jax_log_compiles", True)
+    yield names
+    jax.config.update("jax_log_compiles", False)
 
 
 @pytest.fixture(scope="session")

@@ -1,5 +1,7 @@
 """Trajectories, sensors and covariances found from simulated poses and readings, against the simulation."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 from helpers import hand_held
@@ -8,6 +10,7 @@ from scipy.stats import chi2
 import jaxpose
 from jaxpose.errors import DataError
 from jaxpose.estimate import smooth
+from jaxpose.estimate.smoothing import compile_ahead
 from jaxpose.geometry import rigid
 
 DURATION_S, POSE_HZ = 12.0, 3.0
@@ -70,6 +73,21 @@ def test_the_trajectory_is_found_at_all_times(found):
     distance, angle = np.linalg.norm(away[:, :3], axis=1), np.linalg.norm(away[:, 3:], axis=1)
     assert np.sqrt(np.mean(distance**2)) < 0.010
     assert np.degrees(np.sqrt(np.mean(angle**2))) < 0.15
+
+
+def test_what_is_compiled_ahead_is_not_compiled_again(compiled):
+    """In another thread, by times and readings alone, for some poses less too; not where it was stopped."""
+    t, noisy, imu, _ = trial(0)
+    kept = np.delete(np.arange(len(t) - 4), [5, 6])  # within a time that no other test has
+    heavy = {"linearise", "_moved", "spread", "camera_rows", "_joint"}
+    compile_ahead(t[:-4], imu, EVERYTHING, lambda: True)
+    assert not compiled() & heavy
+    with ThreadPoolExecutor(1) as other:
+        other.submit(compile_ahead, t[:-4], imu, EVERYTHING).result()
+    assert compiled() >= heavy
+    found = smooth(t[kept], noisy[kept], SIGMAS, imu, estimate=EVERYTHING, noise=hand_held.SHEET)
+    found.covariances()
+    assert not compiled() & heavy
 
 
 def test_times_are_asked_together_or_one_by_one(found):

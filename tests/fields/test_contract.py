@@ -71,14 +71,6 @@ SAVED = [name for name in FIELDS if name not in ("in_frame", "anchored", "body_t
 EVERY = pytest.mark.parametrize("name", FIELDS)
 
 
-@pytest.fixture(scope="module", autouse=True)
-def compile_quickly():
-    """Most of a test here is compilation, and nobody waits for what comes of it."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
-
-
 def parameters(field, dtype=jnp.float32):
     """Parameters that are nowhere zero."""
     rng = np.random.default_rng(0)

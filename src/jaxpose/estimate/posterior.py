@@ -1,6 +1,6 @@
 """What an estimate leaves: a continuous trajectory with its covariance, and sensors with theirs."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -174,6 +174,15 @@ def table_times(span: Span) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, 
 
 
 _camera_rows = jax.jit(camera_rows)
+
+
+def posterior_calls(problem: Problem, noise: Noise, span: Span) -> list[tuple[Any, ...]]:
+    """The compiled functions that a posterior asks, each with arguments of such shapes."""
+    factor = jax.eval_shape(lambda *x: solver.spread(solver.linearise(*x))[0], problem, problem.start, noise)
+    times = jax.ShapeDtypeStruct((_TOGETHER,), np.float64)
+    rows = jax.eval_shape(camera_rows, problem, problem.start, times)
+    _, J, pair = (jax.ShapeDtypeStruct((len(table_times(span)[1]), *x.shape[1:]), x.dtype) for x in rows)
+    return [(_camera_rows, problem, problem.start, times), (_joint, factor, J, pair, J, pair)]
 
 
 def posterior_of(

@@ -1,6 +1,6 @@
 """Batch smoothing: one spline through poses and inertial readings, with its sensors and its covariance."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple, get_args
 
 import jax
@@ -15,8 +15,8 @@ from jaxpose.estimate import alignment, inertial, solver
 from jaxpose.estimate.factors import Factor
 from jaxpose.estimate.factors import checked as checked_factors
 from jaxpose.estimate.noise_levels import calibrated, first_levels
-from jaxpose.estimate.posterior import Posterior, posterior_of
-from jaxpose.estimate.system import Prior, Problem, State
+from jaxpose.estimate.posterior import Posterior, posterior_calls, posterior_of
+from jaxpose.estimate.system import Noise, Prior, Problem, State
 from jaxpose.fields._bspline import control_poses_along
 from jaxpose.fields._fit_input import checked_poses
 from jaxpose.geometry import rigid
@@ -98,6 +98,37 @@ def smooth(
     return _solved(measured, guess, fit_noise, knots_hz, drift_s)
 
 
+def compile_ahead(
+    times: ArrayLike, imu: Imu, estimate: Sequence[str], stopped: Callable[[], bool] = lambda: False
+) -> None:
+    """Compile what `smooth` and its posterior run, for about as many poses over the same time.
+
+    For another thread, while the poses are being measured.
+
+    Args:
+        times: timestamps [s] at which poses will be measured; the first and last one count, and how many.
+        imu: readings.
+        estimate: as `smooth` has it.
+        stopped: asked before each function whether it is still wanted.
+
+    Raises:
+        ValueError, DataError: as `smooth`.
+    """
+    T = np.tile(np.eye(4), (np.size(times), 1, 1))
+    measured = _measured(times, T, np.ones(6), None, imu, SENSORS, estimate, None, 0.0, ())
+    guess = _Guess(np.eye(4), np.array(GRAVITY_WORLD), 0.0, 1.0)
+    with jax.enable_x64(True):
+        problem, level, *_ = _posed(measured, guess, True, None, np.inf)
+        span = float(measured.t[0]), float(measured.t[-1])
+        for function, *args in [
+            *solver.compiled_calls(problem, level),
+            *posterior_calls(problem, level, span),
+        ]:
+            if stopped():
+                return
+            function.lower(*args).compile()
+
+
 class _Measured(NamedTuple):
     """What was measured, checked, and what is asked."""
 
@@ -170,9 +201,30 @@ def _guess(measured: _Measured, T_body_cam, gravity_world, offset_s: float) -> _
     return _Guess(T_body_cam, gravity, offset_s, scale)
 
 
+class _Posed(NamedTuple):
+    """A problem to be solved from where it starts, in float64."""
+
+    problem: Problem
+    level: Noise  # of noise: where its estimate starts
+    usual: Noise
+    readings: inertial.NodeReadings
+    clock_s: float  # of the spline's start
+
+
 def _solved(
     measured: _Measured, guess: _Guess, fit_noise: bool, knots_hz: float | None, drift_s: float
 ) -> Posterior:
+    with jax.enable_x64(True):
+        problem, level, usual, readings, first = _posed(measured, guess, fit_noise, knots_hz, drift_s)
+        at = solver.optimise(problem, problem.start, level)
+        if fit_noise:
+            at, level = calibrated(problem, at, level, usual)
+        return posterior_of(problem, at, level, readings, clock_s=first, estimated=measured.estimate)
+
+
+def _posed(
+    measured: _Measured, guess: _Guess, fit_noise: bool, knots_hz: float | None, drift_s: float
+) -> _Posed:
     t, imu = measured.t + guess.offset_s, measured.imu
     margin = _MARGIN_S if "offset" in measured.estimate else 0.0
     first, last = t[0] - margin, t[-1] + margin
@@ -190,32 +242,33 @@ def _solved(
     root_drift, to_camera = _drift_steps(measured.drift, t, metric, ends)
     control = control_poses_along((first, last), intervals, t, along_body)
     levels = first_levels(readings, measured.noise, imu, t, metric, fit_noise)
-    with jax.enable_x64(True):
-        f = lambda x: jnp.asarray(x, jnp.float64)
-        none = np.zeros((intervals // 3 + 1, 6))
-        sensors = (guess.gravity_world, guess.offset_s, guess.T_body_cam, np.log(guess.scale))
-        state = State(*map(f, (control, none, none, *sensors)))
-        prior = jax.tree.map(jnp.asarray, _prior(measured.estimate, measured.noise))
-        problem = Problem(
-            interval_s=f((last - first) / intervals),
-            root=f(readings.root),
-            value=f(readings.value),
-            used=f(measured.used),
-            t=f(measured.t - first),
-            T=f(measured.T),
-            root_information=f(measured.root_information),
-            root_drift=f(root_drift),
-            to_camera=f(to_camera),
-            kept=f(np.exp(-3 * (last - first) / intervals / drift_s)),
-            start=state,
-            prior=prior,
-            factors=jax.tree.map(jnp.asarray, tuple(x._replace(t=x.t - first) for x in measured.factors)),
-        )
-        level, usual = jax.tree.map(f, levels)
-        at = solver.optimise(problem, state, level)
-        if fit_noise:
-            at, level = calibrated(problem, at, level, usual)
-        return posterior_of(problem, at, level, readings, clock_s=first, estimated=measured.estimate)
+    f = lambda x: jnp.asarray(x, jnp.float64)
+    padded = lambda x, mode: np.pad(x, [(0, _room_for(len(t)) - len(t)), *[(0, 0)] * (x.ndim - 1)], mode)
+    none = np.zeros((intervals // 3 + 1, 6))
+    sensors = (guess.gravity_world, guess.offset_s, guess.T_body_cam, np.log(guess.scale))
+    problem = Problem(
+        interval_s=f((last - first) / intervals),
+        root=f(readings.root),
+        value=f(readings.value),
+        used=f(measured.used),
+        t=f(padded(measured.t - first, "edge")),
+        T=f(padded(measured.T, "edge")),
+        root_information=f(padded(measured.root_information, "constant")),
+        root_drift=f(root_drift),
+        to_camera=f(to_camera),
+        kept=f(np.exp(-3 * (last - first) / intervals / drift_s)),
+        start=State(*map(f, (control, none, none, *sensors))),
+        prior=jax.tree.map(jnp.asarray, _prior(measured.estimate, measured.noise)),
+        factors=jax.tree.map(jnp.asarray, tuple(x._replace(t=x.t - first) for x in measured.factors)),
+    )
+    level, usual = jax.tree.map(f, levels)
+    return _Posed(problem, level, usual, readings, first)
+
+
+def _room_for(poses: int) -> int:
+    """About as many, so that a few more or less are compiled once: those beyond them say nothing."""
+    step = max(8, 2 ** (poses.bit_length() - 4))
+    return -(-poses // step) * step
 
 
 def _drift_steps(

@@ -1,6 +1,6 @@
 """Levenberg-Marquardt on a spline's problem, and how large each group's noise turns out to be."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -90,6 +90,12 @@ def spread(at: Linearisation) -> tuple[Factorisation, Covariance, GroupFit]:
     bands, moved, posed = sums[0], sums[1].sum(1), sums[2].sum(1) + sums[3].sum(1)
     of = lambda k: Noise(bands[k, :, 0], bands[k, :, 1], *posed[k], *moved[k])
     return factor, known, GroupFit(of(0), of(1))
+
+
+def compiled_calls(problem: Problem, noise: Noise) -> list[tuple[Any, ...]]:
+    """The compiled functions that solve a problem of these shapes, each with arguments of such shapes."""
+    at = jax.eval_shape(linearise, problem, problem.start, noise)
+    return [(linearise, problem, problem.start, noise), (_moved, at, _DAMPING), (spread, at)]
 
 
 def pair_covariance(known: Covariance) -> Float[Array, "n 70 70"]:

@@ -10,6 +10,7 @@ from jaxpose.geometry import se3
 from jaxpose.imu.types import GRAVITY_WORLD, Gravity, Imu
 
 
+@jax.jit
 def integrate_gyro(
     R_ref_start: Float[Array, "3 3"],
     t: Float[Array, " n"],

@@ -15,6 +15,7 @@ from jaxpose.estimate.posterior import table_times
 from jaxpose.fields import Covariances, Params, PoseField, bspline, fit
 from jaxpose.geometry import rigid
 from jaxpose.imu import Imu
+from jaxpose.slam.config import SlamConfig
 from jaxpose.slam.types import Frames, SlamState, TrackingStatus
 
 _FEWEST = 4  # poses that an estimate can be made of
@@ -98,7 +99,7 @@ def estimate_trajectory(state: SlamState, imu: Imu | None) -> tuple[Posterior | 
         own,
         imu._replace(t=np.asarray(imu.t, np.float64) - frames.t[0]),
         use=use.get(config.imu, ("gyroscope",)),
-        estimate=("biases", "gravity", *(x for x in config.estimate if x != "line-delay")),
+        estimate=estimated_beside_poses(config),
         noise=config.imu_noise,
         T_body_cam=state.T_body_cam,
         gravity_world=state.gravity_world,
@@ -109,6 +110,11 @@ def estimate_trajectory(state: SlamState, imu: Imu | None) -> tuple[Posterior | 
         if max(posterior.noise.position, posterior.noise.rotation) < 1:
             return posterior, None
     return estimated(), tracked_covariances(t, T_world_cam, own)
+
+
+def estimated_beside_poses(config: SlamConfig) -> tuple[str, ...]:
+    """What the final trajectory's estimate finds of the sensors."""
+    return ("biases", "gravity", *(x for x in config.estimate if x != "line-delay"))
 
 
 def own_covariances(frames: Frames) -> Float[np.ndarray, "n 6 6"]:

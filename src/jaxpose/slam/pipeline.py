@@ -18,6 +18,7 @@ from jaxpose.geometry import rigid
 from jaxpose.geometry.camera import Camera, angle_of_view
 from jaxpose.imu import Imu
 from jaxpose.scenes.voxel_blocks import voxel_blocks
+from jaxpose.slam.ahead import end_compiled
 from jaxpose.slam.batch import FinalTrajectory, final_trajectory
 from jaxpose.slam.beginning import begin, begun_again, told_wrongly
 from jaxpose.slam.config import SlamConfig
@@ -133,9 +134,10 @@ def run(
         DataError: where the recording cannot be tracked: fewer than two frames, no depth in the first, an IMU
             asked for and not there.
     """
-    state = track_all(recording, config, on_frame, state)
-    if config.uses_refinement:
-        state = refined(state, recording.read, on_refined)
+    with end_compiled(recording, config):
+        state = track_all(recording, config, on_frame, state)
+        if config.uses_refinement:
+            state = refined(state, recording.read, on_refined)
     found = _final(state, recording.imu)
     if found.posterior is not None and not state.passes and told_wrongly(state, found.posterior):
         return run(recording, config, on_frame, begun_again(state, found.posterior), on_refined)
