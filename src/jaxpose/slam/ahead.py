@@ -1,15 +1,24 @@
-"""The end of a run, compiled while its frames are tracked: that leaves a core idle, and XLA Python's lock."""
+"""What a run will need, compiled while frames are tracked: that leaves a core idle, and XLA Python's lock.
+
+What fails here fails again where it is needed.
+"""
 
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxpose.datasets.types import Recording
 from jaxpose.estimate.smoothing import compile_ahead
 from jaxpose.slam.batch import estimated_beside_poses
 from jaxpose.slam.config import SlamConfig
+from jaxpose.slam.map.backend import map_backend, scene_params
+from jaxpose.slam.observation import Image
+from jaxpose.slam.tracking.relocalise import CENTRES
+from jaxpose.slam.types import SlamState
 
 
 @contextmanager
@@ -29,7 +38,7 @@ def end_compiled(recording: Recording, config: SlamConfig) -> Iterator[None]:
     stopped, imu = threading.Event(), imu._replace(t=np.asarray(imu.t, np.float64) - first)
 
     def work() -> None:
-        with suppress(Exception):  # what fails here fails again where it is needed
+        with suppress(Exception):
             compile_ahead(recording.t - first, imu, estimated_beside_poses(config), stopped.is_set)
 
     thread = threading.Thread(target=work, name="compile ahead")
@@ -39,3 +48,23 @@ def end_compiled(recording: Recording, config: SlamConfig) -> Iterator[None]:
         thread.join()
     finally:
         stopped.set()
+
+
+def compile_search(state: SlamState, image: Image) -> None:
+    """Begin to compile the search for a camera in doubt, so that the first doubt does not wait for it.
+
+    Args:
+        state: after its first frame was mapped.
+        image: of that frame.
+    """
+    assert state.map is not None
+    poses, sigma = jnp.zeros((CENTRES, 4, 4), jnp.float32), jnp.zeros(2, jnp.float32)
+    args = scene_params(state.map), state.map.fusion_state, poses, sigma, image, jax.random.key(0)
+    shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), args)  # the map will be donated
+    search = map_backend(state).relocalise
+
+    def work() -> None:
+        with suppress(Exception):
+            search.lower(*shapes).compile()
+
+    threading.Thread(target=work, name="compile search").start()

@@ -18,7 +18,7 @@ from jaxpose.geometry import rigid
 from jaxpose.geometry.camera import Camera, angle_of_view
 from jaxpose.imu import Imu
 from jaxpose.scenes.voxel_blocks import voxel_blocks
-from jaxpose.slam.ahead import end_compiled
+from jaxpose.slam.ahead import compile_search, end_compiled
 from jaxpose.slam.batch import FinalTrajectory, final_trajectory
 from jaxpose.slam.beginning import begin, begun_again, told_wrongly
 from jaxpose.slam.config import SlamConfig
@@ -203,6 +203,8 @@ def _advance(state: SlamState, frame: Frame, t: float, imu: Imu | None, read: Fr
     state = with_room(frame, points, state, read)
     image = image._replace(exposure=state.exposure)
     state = map_frame(state, image, points, read, generator, map_key)
+    if i == 0:
+        compile_search(state, image)
     if state.frames.keyframe[i]:
         added = lambda kept, new: np.concatenate([kept, new[None]])
         state = state._replace(

@@ -47,6 +47,8 @@ class RelocaliseStep(Protocol):
         key: PRNGKeyArray,
     ) -> Float[Array, "4 4"]: ...
 
+    def lower(self, *shapes: Any) -> jax.stages.Lowered: ...
+
 
 class MapBackend(NamedTuple):
     """A scene, and the steps compiled for the size of its grid."""

@@ -1,0 +1,60 @@
+"""What is compiled while frames are tracked is not compiled again where it is needed."""
+
+import threading
+
+import numpy as np
+import pytest
+from helpers import hand_held
+
+from jaxpose import slam
+from jaxpose.datasets.synthetic import RoomConfig, room
+from jaxpose.datasets.types import Recording
+from jaxpose.errors import DataError
+from jaxpose.geometry.camera import Camera
+from jaxpose.slam.ahead import end_compiled
+from jaxpose.slam.batch import estimate_trajectory
+from jaxpose.slam.types import TrackingStatus, no_frames
+
+OWN = np.repeat([0.004, 0.003], 3)
+
+
+def test_a_run_s_end_is_compiled_while_it_tracks(compiled):
+    """By the recording alone, whatever frames are lost; not for a run without an IMU, nor after an error."""
+    t = 1.7e9 + np.arange(30) / 4
+    imu = hand_held.readings(8.0, 100.0, np.random.default_rng(0))
+    recording = Recording(
+        "", Camera(50.0, 50.0, 31.5, 23.5, 64, 48), t, lambda i: None, imu=imu._replace(t=imu.t + t[0])
+    )
+    config = slam.SlamConfig(imu="combined", estimate=("offset", "line-delay"))
+    with end_compiled(recording, slam.SlamConfig(imu="none")):
+        pass
+    with pytest.raises(DataError), end_compiled(recording._replace(t=t[:2]), config):
+        raise DataError("the first frame")
+    compiled()
+    with end_compiled(recording, config):
+        pass
+    assert {"linearise", "spread"} <= compiled()
+    poses, noise = hand_held.cameras(t - t[0], np.random.default_rng(1), np.eye(4), OWN[:3], OWN[3:])
+    frames = no_frames(t)._replace(T_world_body=noise)
+    frames = frames.put(np.arange(30), covariance=np.diag(OWN**2))
+    frames = frames.put(np.array([9, 17, 18]), status=TrackingStatus.LOST)
+    state = slam.init(recording.camera, config)._replace(frames=frames)
+    posterior, _ = estimate_trajectory(state, recording.imu)
+    assert posterior is not None and len(posterior.covariances().pose) > 100
+    assert np.linalg.norm(posterior.pose(t - t[0])[:, :3, 3] - poses[:, :3, 3], axis=1).max() < 0.02
+    assert not compiled() & {"linearise", "_moved", "spread", "camera_rows", "_joint"}
+
+
+def test_the_search_is_there_before_a_frame_is_in_doubt(compiled):
+    recording = room(RoomConfig(duration_s=1.0, width=64, height=48))
+    state = slam.init(recording.camera, slam.SlamConfig(imu="none", voxel=0.11, features="none"))
+    state = slam.step(state, *recording.read(0), recording.t[0])
+    for thread in threading.enumerate():
+        if thread.name == "compile search":
+            thread.join()
+    assert "search" in compiled()
+    assert not state.frames.lost[0]
+    slam.step(
+        state, *recording.read(5), recording.t[1]
+    )  # at a speed that nothing has told: it is searched for
+    assert not {"search", "update"} & compiled()
