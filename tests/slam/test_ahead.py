@@ -26,14 +26,18 @@ def test_a_run_s_end_is_compiled_while_it_tracks(compiled):
         "", Camera(50.0, 50.0, 31.5, 23.5, 64, 48), t, lambda i: None, imu=imu._replace(t=imu.t + t[0])
     )
     config = slam.SlamConfig(imu="combined", estimate=("offset", "line-delay"))
-    with end_compiled(recording, slam.SlamConfig(imu="none")):
-        pass
-    with pytest.raises(DataError), end_compiled(recording._replace(t=t[:2]), config):
-        raise DataError("the first frame")
-    compiled()
-    with end_compiled(recording, config):
-        pass
-    assert {"linearise", "spread"} <= compiled()
+    seen = []
+    with end_compiled(recording, slam.SlamConfig(imu="none"), seen.append) as on_frame:
+        on_frame(0)
+        on_frame(1)
+    with pytest.raises(DataError), end_compiled(recording, config, None) as on_frame:
+        on_frame(0)
+        raise DataError("the second frame")
+    assert not {"linearise", "spread"} & compiled() and seen == [0, 1]
+    with end_compiled(recording, config, seen.append) as on_frame:
+        for i in range(2, 5):
+            on_frame(i)
+    assert {"linearise", "spread"} <= compiled() and seen == [0, 1, 2, 3, 4]
     poses, noise = hand_held.cameras(t - t[0], np.random.default_rng(1), np.eye(4), OWN[:3], OWN[3:])
     frames = no_frames(t)._replace(T_world_body=noise)
     frames = frames.put(np.arange(30), covariance=np.diag(OWN**2))

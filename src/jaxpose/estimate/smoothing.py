@@ -120,10 +120,8 @@ def compile_ahead(
     with jax.enable_x64(True):
         problem, level, *_ = _posed(measured, guess, True, None, np.inf)
         span = float(measured.t[0]), float(measured.t[-1])
-        for function, *args in [
-            *solver.compiled_calls(problem, level),
-            *posterior_calls(problem, level, span),
-        ]:
+        calls = [*solver.compiled_calls(problem, level), *posterior_calls(problem, level, span)]
+        for function, *args in calls:
             if stopped():
                 return
             function.lower(*args).compile()

@@ -3,9 +3,11 @@
 What fails here fails again where it is needed.
 """
 
+import itertools
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,32 +22,48 @@ from jaxpose.slam.observation import Image
 from jaxpose.slam.tracking.relocalise import CENTRES
 from jaxpose.slam.types import SlamState
 
+_COMPILED_FIRST = 2  # frames
+
 
 @contextmanager
-def end_compiled(recording: Recording, config: SlamConfig) -> Iterator[None]:
+def end_compiled(
+    recording: Recording, config: SlamConfig, on_frame: Callable[[Any], None] | None
+) -> Iterator[Callable[[Any], None] | None]:
     """Compile what makes the final trajectory of a recording; it is there when what this holds is done.
 
-    What ends by an error waits for no more than the function that is being compiled.
+    It begins when the first two frames, which compile themselves, are through. What ends by an error waits
+    for no more than the function that is being compiled.
 
     Args:
         recording: what is tracked.
         config: settings of the run.
+        on_frame: what is called after every frame.
+
+    Yields:
+        What is to be called after every frame.
     """
-    imu, first = recording.imu, recording.t[0]
+    imu, first, stopped = recording.imu, recording.t[0], threading.Event()
     if imu is None or config.uses_field or not config.uses_gyroscope:
-        yield
+        yield on_frame
         return
-    stopped, imu = threading.Event(), imu._replace(t=np.asarray(imu.t, np.float64) - first)
 
     def work() -> None:
         with suppress(Exception):
-            compile_ahead(recording.t - first, imu, estimated_beside_poses(config), stopped.is_set)
+            readings = imu._replace(t=np.asarray(imu.t, np.float64) - first)
+            compile_ahead(recording.t - first, readings, estimated_beside_poses(config), stopped.is_set)
 
-    thread = threading.Thread(target=work, name="compile ahead")
-    thread.start()
+    thread, frames = threading.Thread(target=work, name="compile ahead"), itertools.count(1)
+
+    def on_frame_and_begin(progress: Any) -> None:
+        if next(frames) == _COMPILED_FIRST:
+            thread.start()
+        if on_frame is not None:
+            on_frame(progress)
+
     try:
-        yield
-        thread.join()
+        yield on_frame_and_begin
+        if thread.ident is not None:
+            thread.join()
     finally:
         stopped.set()
 

@@ -134,8 +134,8 @@ def run(
         DataError: where the recording cannot be tracked: fewer than two frames, no depth in the first, an IMU
             asked for and not there.
     """
-    with end_compiled(recording, config):
-        state = track_all(recording, config, on_frame, state)
+    with end_compiled(recording, config, on_frame) as on_each:
+        state = track_all(recording, config, on_each, state)
         if config.uses_refinement:
             state = refined(state, recording.read, on_refined)
     found = _final(state, recording.imu)
