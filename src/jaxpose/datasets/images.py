@@ -1,6 +1,7 @@
 """What loaders share: images, depth, intrinsics and poses, each checked, and the words for what was found."""
 
 import math
+import os
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -185,25 +186,28 @@ def usable_poses(
     finite = np.isfinite(T_world_cam).all((1, 2))
     if not finite.any():
         return None, ("no usable poses: there is no ground truth to compare with",)
-    repaired = []
-    for i in map(int, np.flatnonzero(finite)):
-        pose = T_world_cam[i]
-        if np.abs(pose[:3, 3]).max() > FARTHEST_M or np.abs(pose[:3, :3]).max() > _LARGEST_ENTRY:
-            raise DataError(
-                f"{where(i)}: expected a rotation and a position up to {FARTHEST_M:g} m, got "
-                f"{' '.join(f'{number:g}' for number in pose[:3].ravel())}"
-            )
-        determinant = np.linalg.det(pose[:3, :3])
-        if np.abs(pose[3] - [0, 0, 0, 1]).max() > 1e-6 or determinant <= 0:
-            raise DataError(
-                f"{where(i)}: expected a pose, rotation and last row 0 0 0 1, got determinant "
-                f"{determinant:.3g} and {' '.join(f'{number:g}' for number in pose[3])}"
-            )
-        rotation = nearest_rotation(pose[:3, :3])
-        if np.abs(pose[:3, :3] - rotation).max() > _MOST_OFF_ROTATION:
-            repaired.append(names[i])
-        poses[i] = pose
-        poses[i, :3, :3] = rotation
+    known = np.flatnonzero(finite)
+    given = T_world_cam[known]
+    far = np.abs(given[:, :3, 3]).max(1) > FARTHEST_M
+    far |= np.abs(given[:, :3, :3]).max((1, 2)) > _LARGEST_ENTRY
+    determinant = np.linalg.det(np.where(far[:, None, None], np.eye(3), given[:, :3, :3]))
+    wrong = far | (np.abs(given[:, 3] - [0, 0, 0, 1]).max(1) > 1e-6) | (determinant <= 0)
+    if wrong.any():
+        k = int(np.argmax(wrong))
+        numbers = lambda x: " ".join(f"{number:g}" for number in x)
+        said = f"{where(int(known[k]))}: expected a"
+        if far[k]:
+            position = f"{said} rotation and a position up to {FARTHEST_M:g} m"
+            raise DataError(f"{position}, got {numbers(given[k, :3].ravel())}")
+        raise DataError(
+            f"{said} pose, rotation and last row 0 0 0 1, got determinant {determinant[k]:.3g} and "
+            f"{numbers(given[k, 3])}"
+        )
+    rotations = nearest_rotation(given[:, :3, :3])
+    off = np.abs(given[:, :3, :3] - rotations).max((1, 2)) > _MOST_OFF_ROTATION
+    repaired = [names[int(i)] for i in known[off]]
+    poses[known] = given
+    poses[known, :3, :3] = rotations
     notes = []
     if not finite.all():
         lacking = [names[int(i)] for i in np.flatnonzero(~finite)]
@@ -254,7 +258,11 @@ def only(candidates: Sequence[Path], path: Path, expected: str, kind: str = "fil
 
 def within(files: Sequence[Path], path: Path | str) -> tuple[str, ...]:
     """Files by their names in the folder that the user named, as `Recording.files` has them."""
-    return tuple(str(file.relative_to(path)) for file in files)
+    root = f"{path}{os.sep}"  # most of them are named so, and `relative_to` is slow
+    names = ((str(file), file) for file in files)
+    return tuple(
+        name[len(root) :] if name.startswith(root) else str(file.relative_to(path)) for name, file in names
+    )
 
 
 def name_of(folder: Path) -> str:

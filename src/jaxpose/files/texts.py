@@ -28,7 +28,10 @@ def archive_kind(path: Path) -> str | None:
         The name of its format; None for what is none.
     """
     with path.open("rb") as stream:
-        head = stream.read(8)
+        return _archive(stream.read(8))
+
+
+def _archive(head: bytes) -> str | None:
     return next((name for magic, name in _ARCHIVES.items() if head.startswith(magic)), None)
 
 
@@ -44,9 +47,11 @@ def read_text(path: Path) -> str:
     Raises:
         DataError: For an archive and for other bytes that are no text, by the first of them.
     """
-    if (name := archive_kind(path)) is not None:
-        raise DataError(f"{path}: expected text, got a {name} archive to be unpacked first")
-    content = path.read_bytes()
+    with path.open("rb") as stream:
+        head = stream.read(8)
+        if (name := _archive(head)) is not None:
+            raise DataError(f"{path}: expected text, got a {name} archive to be unpacked first")
+        content = head + stream.read()
     if content[:2] in _UTF16:
         return content.decode("utf-16", errors="replace")
     if b"\0" in content[:_LOOKED_AT]:

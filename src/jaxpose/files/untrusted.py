@@ -361,10 +361,12 @@ class _File(io.BufferedReader):
 
     def __init__(self, path: Path | str):
         super().__init__(io.FileIO(path))
-        self._size = os.fstat(self.fileno()).st_size
+        self.size = os.fstat(self.fileno()).st_size
 
     def read(self, size: int | None = -1, /) -> bytes:
-        return super().read(size if size is None else min(size, max(self._size - self.tell(), 0)))
+        if size is not None and size > io.DEFAULT_BUFFER_SIZE:
+            size = min(size, max(self.size - self.tell(), 0))
+        return super().read(size)
 
 
 @contextmanager
@@ -385,10 +387,8 @@ def opened_image(path: Path | str) -> Iterator[Any]:
     if not os.path.isfile(path):
         raise DataError(f"{path}: expected an image, got nothing")
     with reading(path, "an image"), _File(path) as stream, Image.open(stream, formats=_FORMATS) as image:
-        width, height = image.size
-        size = os.path.getsize(path)
-        if not 0 < width * height <= min(_PIXELS, _PIXELS_PER_BYTE * size):
-            raise ValueError(f"{width}x{height} pixels in {size} bytes")
+        if not 0 < image.width * image.height <= min(_PIXELS, _PIXELS_PER_BYTE * stream.size):
+            raise ValueError(f"{image.width}x{image.height} pixels in {stream.size} bytes")
         yield image
 
 

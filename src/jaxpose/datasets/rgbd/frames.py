@@ -52,7 +52,8 @@ class Poses(NamedTuple):
 
 def visible(folder: Path) -> list[Path]:
     """The files of a folder in order, without hidden ones (macOS adds a `._x` to each x)."""
-    return sorted(file for file in folder.iterdir() if not file.name.startswith("."))
+    files = (file for file in folder.iterdir() if not file.name.startswith("."))
+    return sorted(files, key=lambda file: file.name)
 
 
 def subfolder(folder: Path, names: Sequence[str]) -> Path | None:
@@ -278,7 +279,8 @@ def assembled(
     Raises:
         DataError: Naming the file for anything that cannot be used.
     """
-    size, depth_size = images.size, images.depth(0).shape[1::-1]
+    first = images.depth(0)
+    size, depth_size = images.size, first.shape[1::-1]
     sizes = [f"{width}x{height}" for width, height in (size, depth_size)]
     if not _same_shape(size, depth_size):
         raise DataError(f"{where}: expected {sizes[0]}, the size of {first_color}, got {sizes[1]}")
@@ -289,7 +291,8 @@ def assembled(
         assumed = (f"colour resized from {' to '.join(sizes)}, the size of depth", *assumed)
         camera = resized(camera, *depth_size)
     folder = where.parent if isinstance(where, Path) and where.suffix.lower() in SUFFIXES else where
-    check_some_depth(folder, len(names), images.depth, images.depth_name, images.unit)
+    depth_of = lambda i: images.depth(i) if i else first
+    check_some_depth(folder, len(names), depth_of, images.depth_name, images.unit)
     images.color(0, to)
     T_world_cam, lacking = None, (f"{poses.missing}: there is no ground truth to compare with",)
     if poses.T_world_cam is not None:
