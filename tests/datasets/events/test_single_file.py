@@ -276,7 +276,11 @@ def test_a_packet_of_aedat4_is_no_longer_than_its_file(tmp_path):
     at = 14 + 4 + int.from_bytes(content[14:18], "little") + 4  # the length of the first packet
     damaged = content[:at] + b"\xff\xff\xff\x7f" + content[at + 4 :]
     middle = content.index(b"<")
-    for k, bad in enumerate((damaged, content[:middle] + b"\xff" + content[middle + 1 :])):
+    place = 18 + int.from_bytes(content[18:22], "little") + 12  # of where packets end
+    packets_end = int.from_bytes(content[place : place + 8], "little")
+    assert at < packets_end < len(content)
+    ends = [content[:place] + n.to_bytes(8, "little") + content[place + 8 :] for n in (46, packets_end - 3)]
+    for k, bad in enumerate((damaged, content[:middle] + b"\xff" + content[middle + 1 :], *ends)):
         (tmp_path / f"{k}.aedat4").write_bytes(bad)
         with pytest.raises(DataError, match=f"{k}.aedat4: expected an AEDAT 4 file, got") as error:
             registry.load_events(tmp_path / f"{k}.aedat4")

@@ -66,9 +66,10 @@ def _panics_named(file: Path) -> Iterator[None]:
 def _check(file: Path) -> None:
     """An error for what ends the package, or the whole process: it allots what a packet asks for.
 
-    ValueError for a packet that is longer than the file, ParseError for streams that are no XML.
+    ValueError for packets that do not end within the file or where its header says, ParseError for streams
+    that are no XML.
     """
-    end = file.stat().st_size
+    end, said = file.stat().st_size, -1
     with file.open("rb") as stream:
         stream.seek(len(MAGIC) + len("\r\n"))
         (length,) = struct.unpack("<I", stream.read(4))
@@ -80,8 +81,8 @@ def _check(file: Path) -> None:
         (back,) = struct.unpack_from("<i", header, table)
         size, _, _, place, about = struct.unpack_from("<5H", header + bytes(10), table - back)
         if size >= 8 and place:
-            (packets_end,) = struct.unpack_from("<q", header, table + place)
-            end = packets_end if 0 <= packets_end < end else end
+            (said,) = struct.unpack_from("<q", header, table + place)
+            end = said if 0 <= said < end else end
         if size >= 10 and about:  # the streams, as text
             (text,) = struct.unpack_from("<I", header, table + about)
             (count,) = struct.unpack_from("<I", header, table + about + text)
@@ -91,3 +92,5 @@ def _check(file: Path) -> None:
             if length > end - at - 8:
                 raise ValueError(f"a packet of {length} bytes at {at}, where {end - at - 8} are left")
             stream.seek(length, 1)
+        if end == said and at != end:  # the package goes on until it is there
+            raise ValueError(f"packets that end at {at}, and a header that says {said}")
