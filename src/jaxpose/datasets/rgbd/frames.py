@@ -246,6 +246,12 @@ def of_files(
     return recording._replace(name=name_of(Path(path)))
 
 
+def _first_depth(images: Images) -> tuple[tuple[int, int], Callable[[int], np.ndarray]]:
+    """Width and height of the first image of depth, and what reads them but decodes that one no more."""
+    first = images.depth(0)
+    return first.shape[1::-1], lambda i: images.depth(i) if i else first
+
+
 def assembled(
     where: Path | str,
     images: Images,
@@ -279,8 +285,7 @@ def assembled(
     Raises:
         DataError: Naming the file for anything that cannot be used.
     """
-    first = images.depth(0)
-    size, depth_size = images.size, first.shape[1::-1]
+    size, (depth_size, depth_of) = images.size, _first_depth(images)
     sizes = [f"{width}x{height}" for width, height in (size, depth_size)]
     if not _same_shape(size, depth_size):
         raise DataError(f"{where}: expected {sizes[0]}, the size of {first_color}, got {sizes[1]}")
@@ -291,7 +296,6 @@ def assembled(
         assumed = (f"colour resized from {' to '.join(sizes)}, the size of depth", *assumed)
         camera = resized(camera, *depth_size)
     folder = where.parent if isinstance(where, Path) and where.suffix.lower() in SUFFIXES else where
-    depth_of = lambda i: images.depth(i) if i else first
     check_some_depth(folder, len(names), depth_of, images.depth_name, images.unit)
     images.color(0, to)
     T_world_cam, lacking = None, (f"{poses.missing}: there is no ground truth to compare with",)
