@@ -13,6 +13,7 @@ from jaxpose.errors import DataError
 from jaxpose.geometry.camera import Camera
 from jaxpose.slam.ahead import end_compiled
 from jaxpose.slam.batch import estimate_trajectory
+from jaxpose.slam.map.backend import map_backend
 from jaxpose.slam.types import TrackingStatus, no_frames
 
 OWN = np.repeat([0.004, 0.003], 3)
@@ -58,7 +59,8 @@ def test_the_search_is_there_before_a_frame_is_in_doubt(compiled):
             thread.join()
     assert "search" in compiled()
     assert not state.frames.lost[0]
-    slam.step(
-        state, *recording.read(5), recording.t[1]
-    )  # at a speed that nothing has told: it is searched for
+    search = map_backend(state).relocalise
+    assert search._cache_size() == 0
+    slam.step(state, *recording.read(5), recording.t[1])  # at a speed that nothing has told
+    assert search._cache_size() == 1, "it was searched for"
     assert not {"search", "update"} & compiled()
