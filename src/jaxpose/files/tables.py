@@ -23,6 +23,7 @@ from jaxpose.files.schema import FARTHEST_M
 from jaxpose.files.texts import lines_of
 from jaxpose.files.timestamps import POSES, Stamps, Steps, Unit, format_ns, to_decimal, to_stamps, units
 
+_SEPARATORS = re.compile(r"[,;\s]+")
 _FEW = 50  # rows, of which each is sooner read by itself
 _NO_NUMBER = {"", "nan", "-nan", "null", "none", "na", "n/a"}  # how writers say that there is none
 
@@ -90,7 +91,8 @@ def read_table(path: Path) -> Table:
             separator = _separator(line)
         if line[0] in "#%":
             continue
-        line = re.sub(r"\s+#.*", "", line)
+        if "#" in line:
+            line = re.sub(r"\s+#.*", "", line)
         if separator == ";":  # between decimal commas, where there are any
             line = line.replace(",", ".")
         if separator and line[-1] == separator and line.count(separator) >= width:
@@ -315,7 +317,8 @@ def read_stamped_names(
     wanted = f"a timestamp in {'seconds' if unit == 's' else 'ns'} and a file name"
     lines, words, names = [], [], []
     for number, line in numbered_lines(path):
-        word, *rest = line.split(separator, 1) if separator else re.split(r"[,;\s]+", line, maxsplit=1)
+        blanks = separator is None and "," not in line and ";" not in line
+        word, *rest = line.split(separator, 1) if separator or blanks else _SEPARATORS.split(line, maxsplit=1)
         if not rest or not rest[0].strip():
             raise DataError(f"{path}:{number}: expected {wanted}, got {line[:60]!r}")
         lines.append(number)
@@ -339,13 +342,10 @@ def read_stamped_names(
 def read_all_numbers(path: Path, counts: tuple[int, ...], wanted: str) -> Float[np.ndarray, " n"]:
     """The numbers of a file whatever its lines; DataError with `wanted` unless finite, one of `counts`."""
     words = " ".join(line.partition("#")[0] for _, line in numbered_lines(path)).replace(",", " ").split()
-    try:
-        numbers = np.array([float(word) for word in words])
-    except ValueError:
-        numbers = np.zeros(0)
-    if len(numbers) not in counts or not np.isfinite(numbers).all():
+    numbers = [_number(word) for word in words]
+    if len(numbers) not in counts or not all(x is not None and math.isfinite(x) for x in numbers):
         raise DataError(f"{path}: expected {wanted}, got {' '.join(words)[:60]!r}")
-    return numbers
+    return np.array(numbers, np.float64)
 
 
 def seconds(ns: list[int], t0_ns: int) -> Float[np.ndarray, " n"]:

@@ -146,6 +146,9 @@ class Listing:
 
 def _listed_file(where: Path | str, listing: Listing, name: str) -> Path | None:
     """The file of a name in a list; of one that was absolute on another machine by the last parts of it."""
+    first = name.partition("/")[0]
+    if first and "\\" not in name and ":" not in first:
+        return listing.find(name_inside(where, name))
     parts = re.split(r"[/\\]", name)
     if parts[0] and not re.fullmatch(r"[A-Za-z]:", parts[0]):
         return listing.find(name_inside(where, name))
