@@ -1,6 +1,7 @@
 """The house's own rules: how long things are, and what a public function says of itself."""
 
 import ast
+import re
 from pathlib import Path
 
 import jaxpose
@@ -74,3 +75,16 @@ def test_public_functions_say_what_they_take_and_give():
     assert {"fields.fit", "jaxpose.render_ray", "geometry.exp"} <= functions.keys()
     silent = {name for name, function in functions.items() if lacks(function)}
     assert silent - SILENT == set()
+
+
+def test_files_are_opened_in_one_place():
+    """There a pipe and a device are refused; folders whose files others wrote open none by themselves."""
+    own = re.compile(r"\b(path|file|folder)\.open\(|\.read_(bytes|text)\(|FileIO\(|(?<![\w.])(?<!def )open\(")
+    places = {
+        f"{file.relative_to(PACKAGE)}:{number}: {line.strip()}"
+        for room in ("files", "datasets", "evaluation")
+        for file in sorted((PACKAGE / room).rglob("*.py"))
+        for number, line in enumerate(file.read_text().splitlines(), 1)
+        if own.search(line) and file.name not in ("opening.py", "atomic.py", "run_folder.py")
+    }
+    assert places == set()

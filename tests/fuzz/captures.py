@@ -141,7 +141,7 @@ def _rows() -> np.ndarray:
 
 
 def _events(folder: Path) -> Any:
-    file = next(path for path in folder.iterdir() if path.stem == "recording")
+    file = next((path for path in folder.iterdir() if path.stem == "recording"), folder)
     found = event_registry.load_events(file)
     return found.events.t, found.camera[:4]
 

@@ -28,7 +28,7 @@ sys.path.insert(1, str(Path(__file__).parents[1]))  # what tests share
 SLOWEST_S, MOST_BYTES = 10.0, 1 << 30
 TOGETHER = 10_000  # cases of a process, whose memory grows
 _TELL_S = 5.0
-DEAD_S, ASLEEP_S = 30.0, 600.0  # of the processor, and of the clock, after which a case is ended
+DEAD_S, ASLEEP_S = 30.0, 120.0  # of the processor, and of the clock, after which a case is ended
 
 
 def numbers_of(value: Any):
@@ -78,12 +78,16 @@ def fault_of(target: Any, folder: Path) -> str | None:
 def damage(name: str, number: int, seed: int, folder: Path) -> Path:
     """Damage one file of a folder; returns it."""
     import mutations
+    import replacements
 
     random = Random(zlib.crc32(f"{name} {number} {seed}".encode()))
     files = sorted(path for path in folder.rglob("*") if path.is_file())
     texts = [path for path in files if path.suffix not in (".png", ".jpg")]
     file = random.choice(texts if texts and random.random() < 0.9 else files)
-    file.write_bytes(mutations.mutated(random, file.suffix, file.read_bytes()))
+    if random.random() < 0.15:
+        replacements.put(random, file, files)
+    else:
+        file.write_bytes(mutations.mutated(random, file.suffix, file.read_bytes()))
     return file
 
 

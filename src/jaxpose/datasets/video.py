@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxpose.datasets.rgbd.frames import visible
 from jaxpose.errors import DataError
+from jaxpose.files.opening import check_file
 
 EXTRA = 'pip install -e ".[video]"'
 SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm")
@@ -51,6 +52,7 @@ def opened(path: Path) -> Iterator[Any]:
     except ImportError:
         raise DataError(f"{path}: a video needs the package av: {EXTRA}") from None
     try:
+        check_file(path)
         with av.open(str(path)) as container:
             yield container
     except DataError:
@@ -79,12 +81,15 @@ class Video:
         import av
 
         try:
+            check_file(path)
             self._container = av.open(str(path))
             self._stream = self._container.streams.video[track]
             if self._stream.codec_context is None:
                 raise ValueError("one of a codec that is not known here")
             self._stream.thread_type = "AUTO"
             self.size = (self._stream.codec_context.width, self._stream.codec_context.height)
+        except DataError:
+            raise
         except Exception as error:
             raise _damaged(path, error) from None
         if not stamps or min(self.size) < 1:

@@ -14,6 +14,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from jaxpose._checks import check_shapes
 from jaxpose.errors import DataError
+from jaxpose.files.opening import open_file
 
 _WINDOW, _SIGMA = 11, 1.5  # [px]
 _C1, _C2 = 0.01**2, 0.03**2
@@ -122,7 +123,7 @@ class _Arrays(pickle.Unpickler):
 def _read_weights(file: Path) -> _Weights:
     """Kernel, bias and head of the five layers, float32; DataError for anything else."""
     try:
-        with file.open("rb") as stream:
+        with open_file(file) as stream:
             tree = _Arrays(stream).load()
         network, heads = tree["AlexNet_0"], [tree[f"NetLinLayer_{k}"]["Conv_0"] for k in range(len(_SHAPES))]
         layers = [network[f"Conv_{k}"] for k in range(len(_SHAPES))]

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from jaxpose._checks import check_shapes
 from jaxpose.errors import DataError
 from jaxpose.files.atomic import atomic
+from jaxpose.files.opening import open_text, read_bytes
 from jaxpose.files.schema import FARTHEST_M
 from jaxpose.geometry import rigid
 from jaxpose.geometry.camera import Camera
@@ -224,7 +225,7 @@ def _words(error: Exception) -> str:
 
 
 def _binary_cameras(file: Path) -> Iterator[tuple[int, ColmapCamera]]:
-    content = memoryview(file.read_bytes())
+    content = memoryview(read_bytes(file))
     (count,), at = struct.unpack_from("<Q", content), 8
     for _ in range(count):
         number, model, width, height = struct.unpack_from("<IiQQ", content, at)
@@ -236,7 +237,7 @@ def _binary_cameras(file: Path) -> Iterator[tuple[int, ColmapCamera]]:
 
 
 def _binary_images(file: Path) -> Iterator[tuple[Any, ...]]:
-    content = file.read_bytes()
+    content = read_bytes(file)
     kind = np.dtype([("xy", "<f8", 2), ("point", "<u8")])
     (count,), at = struct.unpack_from("<Q", content), 8
     for _ in range(count):
@@ -254,7 +255,7 @@ def _binary_images(file: Path) -> Iterator[tuple[Any, ...]]:
 
 
 def _binary_points(file: Path) -> Iterator[tuple[int, Any, Any]]:
-    content = memoryview(file.read_bytes())
+    content = memoryview(read_bytes(file))
     point = struct.Struct("<Q3d3BdQ")
     (count,), at = struct.unpack_from("<Q", content), 8
     for _ in range(count):
@@ -277,7 +278,7 @@ def _camera(model: str, width: Any, height: Any, parameters: Sequence[Any]) -> C
 
 
 def _lines(file: Path) -> Iterator[str]:
-    with file.open(encoding="utf-8-sig", errors="surrogateescape") as lines:
+    with open_text(file, "surrogateescape") as lines:
         yield from (line.rstrip("\r\n") for line in lines if not line.startswith("#"))
 
 

@@ -10,6 +10,7 @@ from jaxtyping import Float, Int, UInt8
 from jaxpose._checks import check_shapes
 from jaxpose.errors import DataError
 from jaxpose.files.atomic import atomic
+from jaxpose.files.opening import open_file
 from jaxpose.files.schema import FARTHEST_M
 from jaxpose.files.untrusted import reading
 
@@ -35,7 +36,7 @@ def read_coloured_points(path: Path | str) -> tuple[Float[np.ndarray, "n 3"], UI
         DataError: Naming the file for what cannot be read.
     """
     path = Path(path)
-    with path.open("rb") as stream, reading(path, "a PLY file"):
+    with open_file(path) as stream, reading(path, "a PLY file"):
         form, count, properties, _ = _header(path, stream)
         wanted = dict.fromkeys(("red", "green", "blue"), "u1")
         found = dict(properties)
@@ -62,7 +63,7 @@ def read_points(path: Path | str) -> Float[np.ndarray, "n 3"]:
         DataError: Naming the file (and the line of a header or text) for what cannot be read.
     """
     path = Path(path)
-    with path.open("rb") as stream, reading(path, "a PLY file"):
+    with open_file(path) as stream, reading(path, "a PLY file"):
         form, count, properties, lines = _header(path, stream)
         names = [name for name, _ in properties]
         missing = [axis for axis in "xyz" if axis not in names]

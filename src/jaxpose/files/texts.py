@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from jaxpose.errors import DataError
+from jaxpose.files.opening import open_file
 
 _ARCHIVES = {
     b"\x1f\x8b": "gzip",
@@ -27,7 +28,7 @@ def archive_kind(path: Path) -> str | None:
     Returns:
         The name of its format; None for what is none.
     """
-    with path.open("rb") as stream:
+    with open_file(path) as stream:
         return _archive(stream.read(8))
 
 
@@ -47,7 +48,7 @@ def read_text(path: Path) -> str:
     Raises:
         DataError: For an archive and for other bytes that are no text, by the first of them.
     """
-    with path.open("rb") as stream:
+    with open_file(path) as stream:
         head = stream.read(8)
         if (name := _archive(head)) is not None:
             raise DataError(f"{path}: expected text, got a {name} archive to be unpacked first")

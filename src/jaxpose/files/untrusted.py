@@ -4,7 +4,6 @@ Nothing is unpickled. Whatever goes wrong inside becomes one `DataError` that na
 where there is one. `schema` checks what was read.
 """
 
-import io
 import json
 import math
 import os
@@ -19,6 +18,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from jaxpose.errors import DataError
+from jaxpose.files.opening import BoundedFile, open_file
 from jaxpose.files.texts import read_text
 
 _TEXT_BYTES = 256 << 20  # JSON; its objects take some twenty times as much
@@ -31,6 +31,7 @@ _HEADER = re.compile(
     rb"""['"]shape['"]: \(((?:\d{1,20}L?, ?){0,16}(?:\d{1,20}L?)?)\),? ?\}"""
 )
 _DEFLATE = 1032  # how far deflate can compress
+_UNPACKED, _UNPACKED_PER_BYTE = 1 << 29, 64  # bytes of an archive's arrays, beyond both of which it is none
 _PIXELS = 100_000_000  # of one image
 _PIXELS_PER_BYTE = 4096  # how far PNG and JPEG can
 _FORMATS = ("PNG", "JPEG", "PPM", "BMP", "TIFF", "WEBP")
@@ -84,10 +85,13 @@ def read_npz(path: Path | str, wanted: str) -> dict[str, np.ndarray]:
         DataError: for a damaged file, arrays that are longer than it, and entries that are no plain arrays.
     """
     path = Path(path)
-    with reading(path, wanted), path.open("rb") as stream, zipfile.ZipFile(stream) as archive:
+    with reading(path, wanted), open_file(path) as stream, zipfile.ZipFile(stream) as archive:
         members = archive.infolist()
-        if sum(member.compress_size for member in members) > path.stat().st_size:
+        size, unpacked = path.stat().st_size, sum(member.file_size for member in members)
+        if sum(member.compress_size for member in members) > size:
             raise ValueError("entries that are longer than the file")
+        if unpacked > max(_UNPACKED, _UNPACKED_PER_BYTE * size):
+            raise ValueError(f"{unpacked} bytes packed into {size}")
         found = {}
         for member in members:
             name = member.filename.removesuffix(".npy")
@@ -116,7 +120,7 @@ def read_npy(path: Path | str, wanted: str) -> np.ndarray:
         DataError: for a damaged file, one that is longer or shorter than its header says, and for objects.
     """
     path = Path(path)
-    with reading(path, wanted), path.open("rb") as stream:
+    with reading(path, wanted), open_file(path) as stream:
         return _array(stream, path.stat().st_size)
 
 
@@ -190,7 +194,7 @@ def opened_hdf5(path: Path | str, wanted: str) -> Iterator[Any]:
         raise DataError(
             f'{path}: expected h5py and hdf5plugin to read it, got no {error.name}: pip install -e ".[hdf5]"'
         ) from None
-    Path(path).open("rb").close()  # says what the system says of it
+    open_file(path).close()  # says what the system says of it
     with reading(path, wanted), h5py.File(path, "r") as content:
         yield content
 
@@ -356,19 +360,6 @@ def _numeric(value: Any) -> Any:
 # --- images -------------------------------------------------------------------------------------------------
 
 
-class _File(io.BufferedReader):
-    """A file of which no more is asked than it holds: space for all that is asked is made first."""
-
-    def __init__(self, path: Path | str):
-        super().__init__(io.FileIO(path))
-        self.size = os.fstat(self.fileno()).st_size
-
-    def read(self, size: int | None = -1, /) -> bytes:
-        if size is not None and size > io.DEFAULT_BUFFER_SIZE:
-            size = min(size, max(self.size - self.tell(), 0))
-        return super().read(size)
-
-
 @contextmanager
 def opened_image(path: Path | str) -> Iterator[Any]:
     """Open an image, of which Pillow reads only the header until pixels are asked for.
@@ -386,7 +377,11 @@ def opened_image(path: Path | str) -> Iterator[Any]:
 
     if not os.path.isfile(path):
         raise DataError(f"{path}: expected an image, got nothing")
-    with reading(path, "an image"), _File(path) as stream, Image.open(stream, formats=_FORMATS) as image:
+    with (
+        reading(path, "an image"),
+        BoundedFile(path) as stream,
+        Image.open(stream, formats=_FORMATS) as image,
+    ):
         if not 0 < image.width * image.height <= min(_PIXELS, _PIXELS_PER_BYTE * stream.size):
             raise ValueError(f"{image.width}x{image.height} pixels in {stream.size} bytes")
         yield image

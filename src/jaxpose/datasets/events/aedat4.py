@@ -8,6 +8,7 @@ from xml.etree import ElementTree
 
 from jaxpose.datasets.events.stream import Block, Stream
 from jaxpose.errors import DataError
+from jaxpose.files.opening import open_file
 
 MAGIC = b"#!AER-DAT4.0"
 
@@ -70,7 +71,7 @@ def _check(file: Path) -> None:
     that are no XML.
     """
     end, said = file.stat().st_size, -1
-    with file.open("rb") as stream:
+    with open_file(file) as stream:
         stream.seek(len(MAGIC) + len("\r\n"))
         (length,) = struct.unpack("<I", stream.read(4))
         if length > end:

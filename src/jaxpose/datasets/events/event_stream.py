@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxpose.datasets.events.stream import Block, Stream
 from jaxpose.errors import DataError
+from jaxpose.files.opening import open_file
 
 MAGIC = b"Event Stream"
 _DVS, _HEADER = 1, 20
@@ -20,7 +21,7 @@ _BYTES = 1 << 20
 
 def es_stream(file: Path) -> Stream:
     """The events of an Event Stream file; timestamps are microseconds since the beginning of the file."""
-    with file.open("rb") as stream:
+    with open_file(file) as stream:
         head = stream.read(_HEADER)
     if len(head) < _HEADER or not head.startswith(MAGIC) or head[12] != 2 or head[15] != _DVS:
         got = f"version {head[12]} of type {head[15]}" if len(head) > 15 else "its end"
@@ -29,7 +30,7 @@ def es_stream(file: Path) -> Stream:
 
     def blocks() -> Iterator[Block]:
         elapsed, rest = 0, b""
-        with file.open("rb") as stream:
+        with open_file(file) as stream:
             stream.seek(_HEADER)
             while data := stream.read(_BYTES):
                 raw = np.frombuffer(rest + data, np.uint8)

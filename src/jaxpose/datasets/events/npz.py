@@ -15,6 +15,7 @@ from jaxpose.datasets.images import only, some
 from jaxpose.datasets.types import EventRecording
 from jaxpose.errors import DataError
 from jaxpose.events import Mosaic
+from jaxpose.files.opening import open_file
 from jaxpose.files.untrusted import array_header, reading
 
 
@@ -98,7 +99,7 @@ def _file(path: Path) -> Path:
 def _names(file: Path) -> tuple[str, ...] | None:
     """What the file calls t, x, y and p; None where it has no such arrays."""
     try:
-        with zipfile.ZipFile(file) as archive:
+        with open_file(file) as stream, zipfile.ZipFile(stream) as archive:
             members = {name.removesuffix(".npy") for name in archive.namelist()}
     except Exception:  # zipfile raises many kinds on damaged files
         return None
@@ -123,12 +124,12 @@ def _table(file: Path, stream: Any) -> Iterator[Block]:
 
 def _blocks(file: Path) -> Iterator[Block]:
     if file.suffix.lower() == ".npy":
-        with reading(file, "a whole array"), file.open("rb") as stream:
+        with reading(file, "a whole array"), open_file(file) as stream:
             yield from _table(file, stream)
         return
     with reading(file, "a whole npz file"):
         with ExitStack() as stack:
-            archive = stack.enter_context(zipfile.ZipFile(file))
+            archive = stack.enter_context(zipfile.ZipFile(stack.enter_context(open_file(file))))
             members = {name.removesuffix(".npy") for name in archive.namelist()}
             names = named(members)
             if names is None and len(members) == 1:

@@ -10,6 +10,7 @@ import numpy as np
 from jaxpose.datasets.events.evt import Evt2, Evt3, Evt21, Evt21Swapped
 from jaxpose.datasets.events.stream import BLOCK, Block, Stream, stated_size
 from jaxpose.errors import DataError
+from jaxpose.files.opening import open_file
 
 _Decoder = Evt2 | Evt3
 _BYTES = 1 << 18  # read at a time
@@ -22,7 +23,7 @@ _DAT_EVENT = np.dtype([("t", "<u4"), ("address", "<u4")])
 
 def raw_stream(file: Path) -> Stream:
     """The events of a RAW file; timestamps are microseconds since the camera was started."""
-    with file.open("rb") as stream:
+    with open_file(file) as stream:
         header = _header(file, stream)
         decoder = _decoder(file, header, stream)
     dropped: list[_Decoder] = []
@@ -31,7 +32,7 @@ def raw_stream(file: Path) -> Stream:
     def blocks() -> Iterator[Block]:
         current = decoder()
         dropped[:], cut[:] = [current], []
-        with file.open("rb") as stream:
+        with open_file(file) as stream:
             _header(file, stream)
             while data := stream.read(_BYTES):
                 words, rest = divmod(len(data), current.kind.itemsize)
@@ -51,13 +52,13 @@ def raw_stream(file: Path) -> Stream:
 
 def dat_stream(file: Path) -> Stream:
     """The events of a DAT file; its timestamps of 32 bits turn over every 72 minutes, which is undone."""
-    with file.open("rb") as stream:
+    with open_file(file) as stream:
         size = _size(file, _header(file, stream))
         _dat_type(file, stream)
 
     def blocks() -> Iterator[Block]:
         last, turns = 0, 0
-        with file.open("rb") as stream:
+        with open_file(file) as stream:
             _header(file, stream)
             _dat_type(file, stream)
             while data := stream.read(BLOCK * _DAT_EVENT.itemsize):

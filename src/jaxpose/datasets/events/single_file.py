@@ -14,6 +14,7 @@ from jaxpose.datasets.images import only
 from jaxpose.datasets.types import EventRecording
 from jaxpose.errors import DataError
 from jaxpose.events import Mosaic
+from jaxpose.files.opening import open_file
 
 SUFFIXES = (".raw", ".dat", ".aedat4", ".aedat", ".es", ".csv")
 _WORDS = "one file of events, RAW, DAT, AEDAT 4, ES or csv"
@@ -98,13 +99,13 @@ def is_events(file: Path) -> bool:
         return False
     if file.suffix.lower() == ".csv":
         return holds_events(file)
-    with file.open("rb") as stream:
+    with open_file(file) as stream:
         return stream.read(2) in (b"% ", b"#!", EVENT_STREAM[:2])
 
 
 def _stream(file: Path) -> Stream:
     """The events of a file, by its first bytes."""
-    with file.open("rb") as stream:
+    with open_file(file) as stream:
         head = stream.read(256)
     if head.startswith(EVENT_STREAM):
         return es_stream(file)

@@ -11,6 +11,7 @@ import numpy as np
 from jaxpose.datasets.events.columns import NAMES
 from jaxpose.datasets.events.stream import BLOCK, Block, Stream, Unit, stated_size
 from jaxpose.errors import DataError
+from jaxpose.files.opening import open_text
 
 _COLUMNS = "4 numbers (t x y p)"
 _EXACT_DIGITS = 15  # of a whole number in float64
@@ -68,7 +69,7 @@ def holds_events(file: Path) -> bool:
 
 def _form(file: Path) -> _Form:
     size, unit, header, rows, separator, above = None, None, None, [], None, 0
-    with file.open(encoding="utf-8-sig", errors="replace") as lines:
+    with open_text(file) as lines:
         for number, line in zip(range(_LOOKED_AT), lines, strict=False):
             text = line.strip()[:_LONGEST]
             comment = text[:1] in ("#", "%")
@@ -139,7 +140,7 @@ def _number(word: str) -> float | None:
 
 
 def _blocks(file: Path, form: _Form) -> Iterator[Block]:
-    with file.open(encoding="utf-8-sig", errors="replace") as lines:
+    with open_text(file) as lines:
         kind, polarity = _kind(file, form), _polarity(file, form)
         for _ in range(form.above):
             next(lines, None)
@@ -185,14 +186,14 @@ def _polarity(file: Path, form: _Form) -> dict[int | str, Callable[[str], float]
 
 def _first_row(file: Path, form: _Form, column: int = 0) -> list[str]:
     """The words of the first event that has such a column; none where none has."""
-    with file.open(encoding="utf-8-sig", errors="replace") as lines:
+    with open_text(file) as lines:
         rows = (_split(line, form.separator) for k, line in enumerate(lines) if k >= form.above)
         return next((row for row in rows if len(row) > column), [])
 
 
 def _line_of(file: Path, form: _Form, row: int) -> int:
     """The number of the line that has event `row`."""
-    with file.open(encoding="utf-8-sig", errors="replace") as lines:
+    with open_text(file) as lines:
         for number, line in enumerate(lines, start=1):
             if number > form.above and _split(line, form.separator):
                 if row == 0:
@@ -203,7 +204,7 @@ def _line_of(file: Path, form: _Form, row: int) -> int:
 
 def _name_line(file: Path, form: _Form, error: ValueError) -> NoReturn:
     """DataError with the first line that is none of an event's."""
-    with file.open(encoding="utf-8-sig", errors="replace") as lines:
+    with open_text(file) as lines:
         for number, line in enumerate(lines, start=1):
             fields = _split(line, form.separator) if number > form.above else []
             if fields and len(fields) != form.columns:

@@ -15,6 +15,7 @@ from jaxpose.datasets import lens
 from jaxpose.datasets.images import image_size, open_image, some
 from jaxpose.datasets.lens import WIDEST_DEG, Lens
 from jaxpose.errors import DataError
+from jaxpose.files.opening import read_bytes
 from jaxpose.geometry import camera
 from jaxpose.geometry.camera import Camera
 
@@ -182,7 +183,7 @@ def _by_area(image: Image.Image, size: tuple[int, int]) -> np.ndarray:
 def _orientation(file: Path, image: Image.Image) -> int:
     # In a PNG it may stand behind the pixels, which Pillow decodes to look there.
     if isinstance(image, PngImageFile):
-        content = file.read_bytes()
+        content = read_bytes(file)
         if not any(name in content for name in _PNG_ORIENTATIONS):
             return 1
     return int(image.getexif().get(ExifTags.Base.Orientation, 1))

@@ -15,6 +15,7 @@ from jaxpose.datasets.rgbd.registration import register_depth
 from jaxpose.datasets.types import Frame, Recording
 from jaxpose.datasets.video import Video, opened
 from jaxpose.errors import DataError
+from jaxpose.files.opening import open_file
 from jaxpose.files.tables import seconds
 from jaxpose.geometry.camera import Camera, resized
 from jaxpose.imu import Imu
@@ -99,7 +100,7 @@ def _files(path: Path) -> list[Path]:
 
 
 def _is_ours(file: Path) -> bool:
-    with file.open("rb") as stream:
+    with open_file(file) as stream:
         head = stream.read(_HEAD_BYTES)
     return head.startswith(_MATROSKA) and (b"K4A_" in head or b"k4arecord" in head)
 

@@ -11,6 +11,7 @@ from jaxpose.datasets.rgbd.frames import Listing, Poses, of_files
 from jaxpose.datasets.rgbd.phones import middle
 from jaxpose.datasets.types import Recording
 from jaxpose.errors import DataError
+from jaxpose.files.opening import read_bytes
 from jaxpose.files.schema import choice, numbers
 from jaxpose.files.timestamps import nanoseconds
 from jaxpose.files.untrusted import read_json, read_npy
@@ -32,7 +33,7 @@ def detect(path: Path) -> bool:
         Whether `load` should read it.
     """
     file = path / _FILE
-    return file.is_file() and b'"depth_file_path"' in file.read_bytes()
+    return file.is_file() and b'"depth_file_path"' in read_bytes(file)
 
 
 def has_timestamps(path: Path) -> bool:

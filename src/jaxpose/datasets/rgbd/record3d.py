@@ -22,6 +22,7 @@ from jaxpose.datasets.rgbd.frames import Images, Poses, assembled, visible
 from jaxpose.datasets.rgbd.phones import UNSURE, Y_UP, middle, sure
 from jaxpose.datasets.types import Recording
 from jaxpose.errors import DataError
+from jaxpose.files.opening import open_file, read_bytes
 from jaxpose.files.schema import numbers
 from jaxpose.files.timestamps import nanoseconds
 from jaxpose.files.untrusted import json_object, read_json, reading
@@ -61,7 +62,7 @@ def detect(path: Path) -> bool:
         exr = (path / "depth").glob("*.[eE][xX][rR]")
         return raw or ((path / "metadata.json").is_file() and any(exr))
     if path.suffix.lower() == ".zip" and zipfile.is_zipfile(path):
-        with reading(path, "a zip"), zipfile.ZipFile(path) as archive:
+        with reading(path, "a zip"), open_file(path) as stream, zipfile.ZipFile(stream) as archive:
             names = archive.namelist()
         of_frames = any("rgbd/" in name or name.lower().endswith(".exr") for name in names)
         return of_frames and any(_METADATA.fullmatch(name) for name in names)
@@ -128,7 +129,7 @@ def _open(path: Path) -> _Source:
         stated = next(
             (path / f for f in ("metadata", "metadata.json") if (path / f).is_file()), path / "metadata"
         )
-        read = lambda name: (path / name).read_bytes()
+        read = lambda name: read_bytes(path / name)
         return _Source(path, names, read, read_json(stated, "the metadata of Record3D"))
     if not path.is_file():
         raise DataError(f"{path}: expected an archive of Record3D, got {found(path)}")

@@ -14,6 +14,7 @@ from jaxpose.datasets.rgbd.phones import Y_UP
 from jaxpose.datasets.types import Recording
 from jaxpose.datasets.video import Video, find_video
 from jaxpose.errors import DataError
+from jaxpose.files.opening import open_file
 from jaxpose.files.schema import numbers
 from jaxpose.files.untrusted import json_object, read_json
 
@@ -94,7 +95,7 @@ def _depth(pixels: np.ndarray, near: float, far: float) -> Float32[np.ndarray, "
 
 def _metadata(file: Path) -> dict[str, Any] | None:
     """What the file says at its end, or `metadata.json` beside it; None for another video."""
-    with file.open("rb") as stream:
+    with open_file(file) as stream:
         stream.seek(max(0, file.stat().st_size - _TAIL))
         tail = stream.read()
     if (at := tail.rfind(_KEY)) >= 0:

@@ -1,13 +1,12 @@
 """Bags of ROS 1 and ROS 2 (sqlite3, MCAP) through the package `rosbags`: topics and their messages."""
 
-import io
-import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from jaxpose.datasets.images import found, only
 from jaxpose.errors import DataError
+from jaxpose.files.opening import BoundedFile, check_file, open_file, read_bytes
 
 _MAGIC = {b"#ROSBAG V2.0": ".bag", b"\x89MCAP0\r\n": ".mcap", b"SQLite format 3\0": ".db3"}
 _METADATA = "metadata.yaml"
@@ -15,24 +14,11 @@ _KINDS = "a ROS bag: .bag, .mcap, .db3, or a folder with metadata.yaml"
 EXTRA = 'pip install -e ".[ros]"'
 
 
-class _Clamped(io.BufferedReader):
-    """A file that allots no more than it holds, whatever size a damaged length asks for."""
-
-    def __init__(self, path: Path):
-        super().__init__(io.FileIO(path))
-        self._size = os.fstat(self.fileno()).st_size
-
-    def read(self, size: int | None = -1, /) -> bytes:
-        if size is None or size < 0:
-            return super().read(size)
-        return super().read(min(size, max(self._size - self.tell(), 0)))
-
-
 class _ClampedPath(type(Path())):
     """A path whose binary files are such; `rosbags` takes paths of any kind."""
 
     def open(self, mode: str = "r", *args: Any, **options: Any) -> Any:
-        return _Clamped(self) if mode == "rb" else super().open(mode, *args, **options)
+        return BoundedFile(self) if mode == "rb" else super().open(mode, *args, **options)
 
 
 class Topic(NamedTuple):
@@ -54,14 +40,14 @@ def bag_file(path: Path) -> Path | None:
         What `Bag` opens.
     """
     if path.is_dir():
-        if (path / _METADATA).is_file() and b"rosbag2_bagfile" in (path / _METADATA).read_bytes()[:4096]:
+        if (path / _METADATA).is_file() and b"rosbag2_bagfile" in read_bytes(path / _METADATA)[:4096]:
             return path
         files = [file for suffix in _MAGIC.values() for file in sorted(path.glob(f"[!.]*{suffix}"))]
         bags = [file for file in files if bag_file(file)]
         return only(bags, path, f"one {_KINDS}", "bags") if bags else None
     if not path.is_file():
         return None
-    with path.open("rb") as stream:
+    with open_file(path) as stream:
         head = stream.read(16)
     return path if any(head.startswith(magic) for magic in _MAGIC) else None
 
@@ -83,6 +69,8 @@ class Bag:
             from rosbags.typesys import Stores, get_typestore
         except ImportError:
             raise DataError(f"{path}: a ROS bag needs the package rosbags: {EXTRA}") from None
+        for file in path.iterdir() if path.is_dir() else ():
+            check_file(file)
         try:
             # Bags of ROS 2 before Iron do not hold the definitions of their types.
             store = get_typestore(Stores.ROS2_HUMBLE)

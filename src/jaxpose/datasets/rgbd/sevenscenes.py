@@ -22,6 +22,7 @@ from jaxpose.datasets.images import (
 from jaxpose.datasets.rgbd.frames import Poses, of_files, pair_numbered, visible
 from jaxpose.datasets.types import Recording
 from jaxpose.errors import DataError
+from jaxpose.files.texts import read_text
 from jaxpose.geometry.camera import Camera, resized
 
 _FRAME = re.compile(r"frame-(\d{6})\.(color|depth|pose)\.(png|jpg|jpeg|txt)", re.IGNORECASE)
@@ -98,7 +99,7 @@ def _read_info(folder: Path) -> _Info | None:
     file = folder / "info.txt"
     if not file.is_file():
         return None
-    pairs = (line.partition("=")[::2] for line in file.read_text("utf-8-sig", "replace").splitlines())
+    pairs = (line.partition("=")[::2] for line in read_text(file).splitlines())
     values = {key.strip(): value.split() for key, value in pairs}
     try:
         matrix = np.array(values["m_calibrationDepthIntrinsic"], np.float64).reshape(-1, 4)[:3, :3]
