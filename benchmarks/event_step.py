@@ -16,8 +16,8 @@ import tyro
 from timing import in_turn, machine, milliseconds, product_gflops
 
 from jaxpose import fields, scenes
+from jaxpose._memory import peak_rss_bytes
 from jaxpose.events import PixelIndex
-from jaxpose.files import run_folder
 from jaxpose.geometry.camera import Camera
 from jaxpose.training import events as event_training
 from jaxpose.training.events import EventData, EventTrainConfig
@@ -85,7 +85,7 @@ def main() -> None:
     for loss, taken in times.items():
         rate = gflop[loss] / np.median(taken)
         print(f"  {loss:13} {milliseconds(taken)}, {gflop[loss]:7.1f} GFLOP, {rate:4.0f} GFLOP/s")
-    print(f"  {run_folder.peak_rss_bytes() / 2**30:.2f} GiB of memory at most")
+    print(f"  {peak_rss_bytes() / 2**30:.2f} GiB of memory at most")
 
 
 if __name__ == "__main__":

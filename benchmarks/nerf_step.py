@@ -16,7 +16,7 @@ import tyro
 from timing import in_turn, machine, milliseconds, product_gflops
 
 from jaxpose import fields, scenes
-from jaxpose.files import run_folder
+from jaxpose._memory import peak_rss_bytes
 from jaxpose.geometry.camera import Camera
 from jaxpose.training import photometric
 from jaxpose.training.photometric import Depths, TrainConfig, Views
@@ -77,7 +77,7 @@ def main() -> None:
                 f"{sizes[pose]:,} parameters"
             )
         added = 100 * (np.median(times["posenet"] / times["table"]) - 1)
-        most = run_folder.peak_rss_bytes() / 2**30
+        most = peak_rss_bytes() / 2**30
         print(f"  PoseNet adds {added:.1f}% of time; {most:.2f} GiB of memory at most so far")
 
 

@@ -8,8 +8,8 @@ import pytest
 import jaxpose
 
 LAYERS = (
-    "errors _checks _terminal geometry files nn nn_columns optim losses fields scenes render imu events"
-    " estimate evaluation structure datasets training slam plots experiments cli __main__"
+    "errors _checks _terminal _memory geometry files nn nn_columns optim losses fields scenes render imu"
+    " events estimate evaluation structure datasets training slam plots experiments cli __main__"
 ).split()
 PACKAGE = Path(jaxpose.__file__).parent
 

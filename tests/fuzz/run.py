@@ -170,7 +170,8 @@ def fuzz(seconds: float, names: list[str] | None = None, seed: int = 0, first: i
                 if "fault" in said:
                     fault = f"{said['target']} {said['file']}: {re.sub(r'/tmp/[^ ]*/', '', said['fault'])}"
                     faults[fault] += 1
-                    examples.setdefault(fault, number)
+                    if examples.setdefault(fault, number) == number:
+                        print(f"{fault}  (case {number})", file=sys.stderr, flush=True)
             last = process.stderr.read()[-300:]
         number += 1
         if not ended:

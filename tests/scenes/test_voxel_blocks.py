@@ -17,6 +17,7 @@ from jaxpose.scenes.voxel_blocks import (
     empty_blocks,
     encoded,
     packed,
+    sample_blocks,
     unpacked,
     with_blocks,
 )
@@ -68,6 +69,14 @@ def test_blocks_that_were_taken_apart_are_put_together_as_they_were():
     assert_array_equal(np.asarray(again.values)[:count], values[:count])
     assert_array_equal(np.asarray(again.coords)[:count], np.asarray(blocks.coords)[:count])
     assert not np.asarray(again.table)[0].any() and int(again.table.max()) == count - 1
+
+
+def test_what_is_free_is_stored_as_zeros():
+    free = np.tile([0.15, 0.5, 0.5, 0.5, 0, 0, 0, 0], (3, 1)).astype(np.float32)
+    assert not np.asarray(encoded(CONFIG, jnp.asarray(free))).any()
+    assert_allclose(decoded(CONFIG, np.zeros((3, 8), np.int16)), free, atol=1e-4)
+    found = sample_blocks(CONFIG, empty_blocks(CONFIG, capacity=8, side=2, bricks=2), jnp.ones(3))
+    assert_allclose(found, [0.15, 0.5, 0.5, 0.5, 0, 0], atol=1e-4)
 
 
 def test_a_budget_counts_the_pool_while_it_grows():

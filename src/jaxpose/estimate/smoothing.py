@@ -10,6 +10,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from jaxpose._checks import check_increasing, check_shapes
+from jaxpose._memory import give_back_memory
 from jaxpose.errors import DataError
 from jaxpose.estimate import alignment, inertial, solver
 from jaxpose.estimate.factors import Factor
@@ -125,6 +126,7 @@ def compile_ahead(
             if stopped():
                 return
             function.lower(*args).compile()
+            give_back_memory()
 
 
 class _Measured(NamedTuple):

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from jaxpose._memory import peak_rss_bytes
 from jaxpose.files import run_folder
 from jaxpose.files.schema import choice
 from jaxpose.files.untrusted import read_json
@@ -49,7 +50,7 @@ def cost(started: float) -> dict[str, Any]:
     return {
         "versions": run_folder.versions(),
         "wall_s": time.perf_counter() - started,
-        "peak_rss_bytes": run_folder.peak_rss_bytes(),
+        "peak_rss_bytes": peak_rss_bytes(),
     }
 
 

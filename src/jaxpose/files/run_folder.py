@@ -1,6 +1,5 @@
 """The folder of a run, and what it states about machine and versions."""
 
-import ctypes
 import os
 import platform
 import socket
@@ -100,29 +99,6 @@ def _locked(folder: Path) -> Iterator[None]:
     finally:
         path.unlink(missing_ok=True)
         stream.close()
-
-
-def give_back_memory() -> None:
-    """Hand memory that was freed to the system, where the C library keeps it: some 270 MB after compiling."""
-    if platform.system() == "Linux" and platform.libc_ver()[0] == "glibc":
-        ctypes.CDLL("libc.so.6").malloc_trim(0)
-
-
-def peak_rss_bytes() -> int:
-    """The most memory that this process has held.
-
-    Returns:
-        [bytes].
-    """
-    status = Path("/proc/self/status")
-    for line in status.read_text().splitlines() if status.exists() else ():
-        if line.startswith("VmHWM:"):
-            return int(line.split()[1]) * 1024
-    import resource  # not on Windows
-
-    # Also counts the parent up to the fork, hence the second choice; macOS gives bytes, others kilobytes.
-    unit = 1 if platform.system() == "Darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
 
 
 def versions() -> dict[str, str]:

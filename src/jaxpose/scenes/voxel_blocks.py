@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Shaped
 
+from jaxpose._memory import give_back_zeros
 from jaxpose.scenes.types import SceneField
 from jaxpose.scenes.voxel_grid import GridConfig
 
@@ -34,6 +35,9 @@ _ROW_BYTES = 2 * NODES**3 * CHANNELS
 # may be exposed as another image, up to 2; and the roots of weights, up to `MEMORY`.
 MEMORY = 100.0  # frames, at a depth of one metre: older ones are slowly forgotten
 _WHOLE = 2**15 - 1
+# What stands where nothing was seen: free space, grey, no wide-band distance, no weights. It is taken off
+# what is stored (16 bits turn over), so that zeros are free space: rows not in use then take no memory.
+_FREE = np.array([_WHOLE, round(_WHOLE / 4), round(_WHOLE / 4), round(_WHOLE / 4), 0, 0, 0, 0], np.int16)
 
 
 @dataclass(frozen=True)
@@ -109,7 +113,7 @@ def empty_blocks(
         jnp.zeros((bricks, _BRICK, _BRICK, _BRICK), jnp.int32),
         jnp.zeros((capacity, 3), jnp.int32),
         jnp.int32(1),
-        jnp.broadcast_to(_free(config), (capacity, NODES, NODES, NODES, CHANNELS)),
+        _free_rows(capacity),
     )
 
 
@@ -119,12 +123,13 @@ def encoded(config: BlockConfig, values: Float[Array, "*n 8"]) -> Int[Array, "*n
     scaled = jnp.concatenate([values[..., :SAMPLED] / _range(config, values.ndim), weights], axis=-1)
     whole = jnp.round(_WHOLE * jnp.clip(scaled, -1, 1))
     least = jnp.concatenate([jnp.full_like(whole[..., :SAMPLED], -_WHOLE), jnp.sign(weights)], axis=-1)
-    return jnp.maximum(whole, least).astype(jnp.int16)  # what has a weight keeps one
+    return jnp.maximum(whole, least).astype(jnp.int16) - _free(whole.ndim)  # what has a weight keeps one
 
 
 def decoded(config: BlockConfig, stored: Int[Any, "*n 8"]) -> Float[Any, "*n 8"]:
     """The channels of nodes that `encoded` has made, float32; arrays stay where they are."""
-    scaled, join = stored.astype(np.float32) / np.float32(_WHOLE), jnp.concatenate
+    scaled = (stored + _free(stored.ndim)).astype(np.float32) / np.float32(_WHOLE)
+    join = jnp.concatenate
     if isinstance(stored, np.ndarray):
         join = np.concatenate
     weights = np.float32(MEMORY) * scaled[..., SAMPLED:] ** 2
@@ -146,7 +151,8 @@ def sample_blocks(config: BlockConfig, blocks: Blocks, point: Float[Array, "3"])
 
     def node(stored):
         known = (stored[CHANNELS - 1 :] > 0).astype(point.dtype)
-        return jnp.concatenate([stored[:SAMPLED].astype(point.dtype) * scale.astype(point.dtype), known])
+        sampled = (stored[:SAMPLED] + _FREE[:SAMPLED]).astype(point.dtype)
+        return jnp.concatenate([sampled * scale.astype(point.dtype), known])
 
     row, local = block_at(config, blocks, point)
     return trilinear_in_block(blocks.values, row, local, node)
@@ -220,7 +226,8 @@ def with_blocks(
         return blocks
     capacity = _room_for(count + len(new), len(values), min(budget, _MOST_BYTES - 1) / _ROW_BYTES)
     if capacity > len(values):
-        values = _enlarged(values, _free(config), capacity)
+        values = _enlarged(values, capacity)
+        give_back_zeros(values, count)
     table, coords = np.array(table), np.pad(np.asarray(coords), [(0, capacity - len(coords)), (0, 0)])
     table[tuple(x[is_new] for x in place)] = np.arange(count, count + len(new))
     coords[count : count + len(new)] = new
@@ -265,10 +272,30 @@ def _room_for(count: int, room: int, most: float = np.inf) -> int:
     return room
 
 
-@partial(jax.jit, static_argnums=2)
-def _enlarged(values: Int[Array, "c n n n k"], free: Int[Array, " k"], capacity: int):
+def _free(dimensions: int) -> Int[np.ndarray, "... 8"]:
+    """`_FREE` along the last of some dimensions."""
+    return _FREE.reshape((1,) * (dimensions - 1) + (CHANNELS,))
+
+
+def _free_rows(capacity: int) -> Int[Array, "c n n n k"]:
+    """A pool of free rows, that takes memory as they are used."""
+    rows = jnp.zeros((capacity, NODES, NODES, NODES, CHANNELS), jnp.int16)
+    give_back_zeros(rows)
+    return rows
+
+
+@partial(jax.jit, static_argnums=1)
+def _enlarged(values: Int[Array, "c n n n k"], capacity: int) -> Int[Array, "d n n n k"]:
     """A pool with more rows, free ones."""
-    return jnp.broadcast_to(free, (capacity, *values.shape[1:])).at[: len(values)].set(values)
+    return jnp.zeros((capacity, *values.shape[1:]), values.dtype).at[: len(values)].set(values)
+
+
+@partial(jax.jit, donate_argnums=0)
+def with_first_rows(
+    pool: Int[Array, "c 9 9 9 8"], values: Int[Array, "n 9 9 9 8"]
+) -> Int[Array, "c 9 9 9 8"]:
+    """The pool with its first rows behind the empty one as they were, in the same memory."""
+    return pool.at[1 : len(values) + 1].set(values)
 
 
 def packed(blocks: Blocks) -> tuple[Int[np.ndarray, "n 3"], Int[np.ndarray, "n 9 9 9 8"]]:
@@ -285,7 +312,7 @@ def unpacked(
     if not len(coords):
         return blocks
     blocks = with_blocks(config, blocks, np.asarray(coords, np.int64))
-    return blocks._replace(values=blocks.values.at[1 : len(coords) + 1].set(jnp.asarray(values)))
+    return blocks._replace(values=with_first_rows(blocks.values, jnp.asarray(values)))
 
 
 def blocks_of_grid(config: GridConfig, values: Float[np.ndarray, "x y z 4"]) -> tuple[BlockConfig, Blocks]:
@@ -319,11 +346,6 @@ def bounds(config: BlockConfig, blocks: Blocks) -> Float[np.ndarray, "2 3"]:
     if not len(coords):
         return np.zeros((2, 3))
     return CELLS * config.voxel * np.stack([coords.min(axis=0), coords.max(axis=0) + 1])
-
-
-def _free(config: BlockConfig) -> Int[Array, "8"]:
-    """What stands where nothing was seen: free space, grey, no wide-band distance, no weights."""
-    return encoded(config, jnp.array([config.truncation, 0.5, 0.5, 0.5, *[0.0] * (CHANNELS - 4)]))
 
 
 def _between(a: Float[Array, " c"], b: Float[Array, " c"], fraction: Float[Array, ""]) -> Float[Array, " c"]:

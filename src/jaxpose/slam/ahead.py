@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxpose._memory import give_back_memory
 from jaxpose.datasets.types import Recording
 from jaxpose.estimate.smoothing import compile_ahead
 from jaxpose.slam.batch import estimated_beside_poses
@@ -84,5 +85,6 @@ def compile_search(state: SlamState, image: Image) -> None:
     def work() -> None:
         with suppress(Exception):
             search.lower(*shapes).compile()
+            give_back_memory()
 
     threading.Thread(target=work, name="compile search").start()

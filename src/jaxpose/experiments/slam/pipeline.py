@@ -10,6 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from jaxpose._memory import give_back_memory
 from jaxpose.datasets.types import Recording
 from jaxpose.evaluation import trajectory_error
 from jaxpose.experiments.checks import own_folder
@@ -139,7 +140,7 @@ def _single(
         keep(progress)
         on_update(tracking_update(mode + ", second pass" * progress.state.passes, progress))
         if progress.index < _COMPILING or progress.index == progress.count - 1:
-            run_folder.give_back_memory()
+            give_back_memory()
         if progress.index == progress.count - 1:
             on_update(_END)
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from jaxpose._memory import give_back_memory
 from jaxpose.datasets.origin import moved
 from jaxpose.datasets.types import Recording
 from jaxpose.estimate import Sensors
@@ -29,7 +30,6 @@ from jaxpose.fields import save, shifted
 from jaxpose.files import atomic, trajectories
 from jaxpose.files.camera_json import write_camera
 from jaxpose.files.ply import write_ply
-from jaxpose.files.run_folder import give_back_memory
 from jaxpose.geometry.rigid import Similarity
 from jaxpose.plots import slam as slam_plots
 from jaxpose.slam import SlamResult, saved_map

@@ -6,12 +6,13 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
+from jaxpose._memory import give_back_zeros
 from jaxpose.datasets.types import Frame
 from jaxpose.errors import DataError
 from jaxpose.geometry import rigid
-from jaxpose.scenes.voxel_blocks import BlockConfig, Blocks, PoolFull, with_blocks
+from jaxpose.scenes.voxel_blocks import BlockConfig, Blocks, PoolFull, with_blocks, with_first_rows
 from jaxpose.slam.keyframes import FrameReader
 from jaxpose.slam.map.backend import allocation_points, grow_to_fit, map_backend
 from jaxpose.slam.map.integrate import grown_map
@@ -49,9 +50,11 @@ def rebuilt(
     """
     assert state.map is not None
     begun, earlier = _emptied(state.map.params), state.earlier
+    give_back_zeros(begun.values)
     if earlier is not None:
         assert isinstance(state.grid, BlockConfig)
-        begun = _refilled(with_blocks(state.grid, begun, earlier.coords.astype(np.int64)), earlier.values)
+        begun = with_blocks(state.grid, begun, earlier.coords.astype(np.int64))
+        begun = begun._replace(values=with_first_rows(begun.values, jnp.asarray(earlier.values)))
     return resumed(state._replace(map=MapState(begun, ()), pending=chosen), read, at_once)
 
 
@@ -126,14 +129,7 @@ def _coarser(state: SlamState) -> SlamState:
 def _emptied(blocks: Blocks) -> Blocks:
     """The blocks with nothing in them, in the same memory; row 0 is empty space."""
     nothing = jax.tree.map(jnp.zeros_like, blocks)
-    values = jnp.broadcast_to(blocks.values[:1], blocks.values.shape)
-    return nothing._replace(corner=blocks.corner, count=jnp.ones_like(blocks.count), values=values)
-
-
-@partial(jax.jit, donate_argnums=0)
-def _refilled(blocks: Blocks, values: Int[Array, "n 9 9 9 8"]) -> Blocks:
-    """The blocks with the first rows as they were, in the same memory."""
-    return blocks._replace(values=blocks.values.at[1 : len(values) + 1].set(values))
+    return nothing._replace(corner=blocks.corner, count=jnp.ones_like(blocks.count))
 
 
 def posed(state: SlamState, frame: Frame, i: int) -> Posed:

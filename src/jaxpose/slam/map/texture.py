@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int, UInt8
 
-from jaxpose.files.run_folder import give_back_memory
+from jaxpose._memory import give_back_memory
 from jaxpose.geometry import se3
 from jaxpose.geometry.camera import Camera
 from jaxpose.scenes import SceneField
