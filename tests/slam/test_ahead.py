@@ -1,6 +1,7 @@
 """What is compiled while frames are tracked is not compiled again where it is needed."""
 
 import threading
+from functools import partial
 
 import numpy as np
 import pytest
@@ -13,7 +14,8 @@ from jaxpose.errors import DataError
 from jaxpose.geometry.camera import Camera
 from jaxpose.slam.ahead import end_compiled
 from jaxpose.slam.batch import estimate_trajectory
-from jaxpose.slam.map.backend import map_backend
+from jaxpose.slam.map import backend
+from jaxpose.slam.map.backend import map_backend, pool_size
 from jaxpose.slam.types import TrackingStatus, no_frames
 
 OWN = np.repeat([0.004, 0.003], 3)
@@ -55,7 +57,7 @@ def test_the_search_is_there_before_a_frame_is_in_doubt(compiled):
     state = slam.init(recording.camera, slam.SlamConfig(imu="none", voxel=0.11, features="none"))
     state = slam.step(state, *recording.read(0), recording.t[0])
     for thread in threading.enumerate():
-        if thread.name == "compile search":
+        if thread.name == "compile ahead":
             thread.join()
     assert "search" in compiled()
     assert not state.frames.lost[0]
@@ -64,3 +66,25 @@ def test_the_search_is_there_before_a_frame_is_in_doubt(compiled):
     slam.step(state, *recording.read(5), recording.t[1])  # at a speed that nothing has told
     assert search._cache_size() == 1, "it was searched for"
     assert not {"search", "update"} & compiled()
+
+
+def test_no_frame_waits_for_a_larger_pool(compiled, monkeypatch):
+    """What a pool needs that is half as large again is there when the first is full."""
+    monkeypatch.setattr(backend, "empty_blocks", partial(backend.empty_blocks, capacity=210))
+    recording = room(RoomConfig(duration_s=6.0, width=64, height=48))
+    config = slam.SlamConfig(imu="none", voxel=0.11, features="none", map_every_s=0.0)
+    state, sizes, at = slam.init(recording.camera, config), [], []
+    for i, t in enumerate(recording.t):
+        state = slam.step(state, *recording.read(i), t)
+        sizes.append(pool_size(state)[1])
+        for thread in threading.enumerate():
+            if thread.name == "compile ahead":
+                thread.join()
+        at.append(compiled())
+        if sizes[-1] == 472:
+            break
+    assert sorted({*sizes}) == [210, 315, 472]
+    # The first growth passes three quarters of what it makes, too: the size after that is compiled there.
+    assert "_enlarged" in at[-1] and not at[-1] & {"step", "update", "search"}
+    assert [frame for frame in at[2:] if "step" in frame] == [frame for frame in at[2:] if "search" in frame]
+    assert sum("step" in frame for frame in at[2:]) == 2

@@ -6,11 +6,20 @@ from pathlib import Path
 import numpy as np
 
 from jaxpose.errors import DataError
-from jaxpose.files.schema import FARTHEST_M, check_version, choice, increasing, numbers, rigid_transforms
+from jaxpose.files.schema import (
+    FARTHEST_M,
+    LATEST_S,
+    check_version,
+    choice,
+    increasing,
+    numbers,
+    rigid_transforms,
+)
 from jaxpose.files.untrusted import read_npz
 
 VERSION = 1
 _MOST_OCTAVES, _MOST_WEIGHT = 64, 1e6
+_SHORTEST_S = 1e-9  # of what a field is stretched over
 
 
 def read_entries(path: Path | str) -> dict[str, np.ndarray]:
@@ -38,8 +47,8 @@ def read_entries(path: Path | str) -> dict[str, np.ndarray]:
 
 
 def _check_span(path: Path | str, data: Mapping, key: str, *, above: bool = True) -> None:
-    first, last = numbers(path, data, key, (2,))
-    if not (first < last if above else first <= last):
+    first, last = numbers(path, data, key, (2,), least=-LATEST_S, most=LATEST_S)
+    if not last - first >= (_SHORTEST_S if above else 0):
         raise DataError(f"{path}: {key}: expected two increasing times, got {first:g} and {last:g}")
 
 

@@ -224,7 +224,7 @@ def with_blocks(
     new, values = wanted[is_new], blocks.values
     if not len(new):
         return blocks
-    capacity = _room_for(count + len(new), len(values), min(budget, _MOST_BYTES - 1) / _ROW_BYTES)
+    capacity = _room_for(count + len(new), len(values), _most_rows(budget))
     if capacity > len(values):
         values = _enlarged(values, capacity)
         give_back_zeros(values, count)
@@ -282,6 +282,18 @@ def _free_rows(capacity: int) -> Int[Array, "c n n n k"]:
     rows = jnp.zeros((capacity, NODES, NODES, NODES, CHANNELS), jnp.int16)
     give_back_zeros(rows)
     return rows
+
+
+def next_capacity(capacity: int, budget: float) -> int | None:
+    """How many blocks a full pool will have room for; None where a budget [bytes] holds no more."""
+    try:
+        return _room_for(capacity + 1, capacity, _most_rows(budget))
+    except PoolFull:
+        return None
+
+
+def _most_rows(budget: float) -> float:
+    return min(budget, _MOST_BYTES - 1) / _ROW_BYTES
 
 
 @partial(jax.jit, static_argnums=1)

@@ -16,14 +16,19 @@ import numpy as np
 from jaxpose._memory import give_back_memory
 from jaxpose.datasets.types import Recording
 from jaxpose.estimate.smoothing import compile_ahead
+from jaxpose.scenes.voxel_blocks import next_capacity
 from jaxpose.slam.batch import estimated_beside_poses
 from jaxpose.slam.config import SlamConfig
-from jaxpose.slam.map.backend import map_backend, scene_params
+from jaxpose.slam.map.backend import map_backend, pool_size, scene_params
+from jaxpose.slam.map.photometric import MapState
 from jaxpose.slam.observation import Image
+from jaxpose.slam.tracker import tracking_problem
+from jaxpose.slam.tracking.predict import MotionPrediction
 from jaxpose.slam.tracking.relocalise import CENTRES
 from jaxpose.slam.types import SlamState
 
 _COMPILED_FIRST = 2  # frames
+_NEARLY_FULL = 0.75  # of a pool
 
 
 @contextmanager
@@ -77,14 +82,58 @@ def compile_search(state: SlamState, image: Image) -> None:
         image: of that frame.
     """
     assert state.map is not None
-    poses, sigma = jnp.zeros((CENTRES, 4, 4), jnp.float32), jnp.zeros(2, jnp.float32)
-    args = scene_params(state.map), state.map.fusion_state, poses, sigma, image, jax.random.key(0)
-    shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), args)  # the map will be donated
-    search = map_backend(state).relocalise
+    _begin([(map_backend(state).relocalise, *_search_arguments(state.map, image))])
 
-    def work() -> None:
-        with suppress(Exception):
-            search.lower(*shapes).compile()
+
+def compile_growth(state: SlamState, used: int, image: Image, expected: MotionPrediction) -> None:
+    """Begin to compile what a larger pool of blocks needs, once the present one is three quarters full.
+
+    Args:
+        state: after a frame was mapped.
+        used: rows of the pool that were in use before it.
+        image: of that frame.
+        expected: of its motion.
+    """
+    assert state.map is not None
+    backend, capacity = map_backend(state), pool_size(state)[1]
+    larger = next_capacity(capacity, state.config.map_budget)
+    if not used < _NEARLY_FULL * capacity <= pool_size(state)[0] or larger is None:
+        return
+    resized = lambda x: jax.ShapeDtypeStruct((larger, *x.shape[1:]), x.dtype)
+    blocks = state.map.params
+    grown = state.map._replace(
+        params=blocks._replace(coords=resized(blocks.coords), values=resized(blocks.values))
+    )
+    problem = tracking_problem(state, state.frames, expected, np.random.default_rng(0))
+    tracked = (
+        grown.params,
+        grown.fusion_state,
+        state.params,
+        problem,
+        image,
+        jnp.float32(0),
+        jax.random.key(0),
+    )
+    _begin([
+        (backend.track, *tracked),
+        (backend.update, grown, image, jnp.zeros((4, 4), jnp.float32)),
+        (backend.relocalise, *_search_arguments(grown, image)),
+    ])  # fmt: skip
+
+
+def _search_arguments(state: MapState, image: Image) -> tuple[Any, ...]:
+    poses, sigma = jnp.zeros((CENTRES, 4, 4), jnp.float32), jnp.zeros(2, jnp.float32)
+    return scene_params(state), state.fusion_state, poses, sigma, image, jax.random.key(0)
+
+
+def _begin(calls: list[tuple[Any, ...]]) -> None:
+    """Compile functions for such arguments in a thread."""
+    shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), [args for _, *args in calls])
+
+    def work() -> None:  # the arguments themselves may be donated meanwhile
+        for (function, *_), args in zip(calls, shapes, strict=True):
+            with suppress(Exception):
+                function.lower(*args).compile()
             give_back_memory()
 
-    threading.Thread(target=work, name="compile search").start()
+    threading.Thread(target=work, name="compile ahead").start()

@@ -18,7 +18,7 @@ from jaxpose.geometry import rigid
 from jaxpose.geometry.camera import Camera, angle_of_view
 from jaxpose.imu import Imu
 from jaxpose.scenes.voxel_blocks import voxel_blocks
-from jaxpose.slam.ahead import compile_search, end_compiled
+from jaxpose.slam.ahead import compile_growth, compile_search, end_compiled
 from jaxpose.slam.batch import FinalTrajectory, final_trajectory
 from jaxpose.slam.beginning import begin, begun_again, told_wrongly
 from jaxpose.slam.config import SlamConfig
@@ -27,7 +27,14 @@ from jaxpose.slam.keyframes import FrameReader, coarse_depth, keyframe_images, t
 from jaxpose.slam.loops.closure import with_loops
 from jaxpose.slam.loops.rebuild import EACH, resumed, with_room
 from jaxpose.slam.loops.refine import refined
-from jaxpose.slam.map.backend import as_blocks, framed_field, is_mapped, map_frame, seen_points
+from jaxpose.slam.map.backend import (
+    as_blocks,
+    framed_field,
+    is_mapped,
+    map_frame,
+    pool_size,
+    seen_points,
+)
 from jaxpose.slam.map.texture import make_texture, painted_over, textured
 from jaxpose.slam.observation import to_device
 from jaxpose.slam.readings import all_readings, joined, readings_until
@@ -200,11 +207,14 @@ def _advance(state: SlamState, frame: Frame, t: float, imu: Imu | None, read: Fr
         return state
     away = np.linalg.norm(points - T_world_cam[:3, 3], axis=1)
     state = state._replace(max_depth=max(state.max_depth, 1.2 * float(np.percentile(away, 99))))
+    used, _ = pool_size(state)
     state = with_room(frame, points, state, read)
     image = image._replace(exposure=state.exposure)
     state = map_frame(state, image, points, read, generator, map_key)
-    if i == 0:
+    if predicted is None:
         compile_search(state, image)
+    elif used:
+        compile_growth(state, used, image, predicted)
     if state.frames.keyframe[i]:
         added = lambda kept, new: np.concatenate([kept, new[None]])
         state = state._replace(

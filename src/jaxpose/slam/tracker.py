@@ -295,7 +295,7 @@ def _track(
             scene_params(state.map),
             state.map.fusion_state,
             state.params,
-            _problem(state, frames, predicted, generator),
+            tracking_problem(state, frames, predicted, generator),
             image,
             jnp.float32(state.max_depth),
             key,
@@ -303,7 +303,7 @@ def _track(
     )
 
 
-def _problem(
+def tracking_problem(
     state: SlamState, frames: Frames, predicted: MotionPrediction, generator: np.random.Generator
 ) -> TrackingProblem:
     """What the tracking step starts from."""

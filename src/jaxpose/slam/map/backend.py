@@ -136,6 +136,13 @@ def scene_params(state: MapState) -> Params:
 _merge = jax.jit(merge)
 
 
+def pool_size(state: SlamState) -> tuple[int, int]:
+    """How many rows of the map's pool of blocks are in use, and how many there are; none of a grid."""
+    if state.map is None or not isinstance(state.map.params, Blocks):
+        return 0, 0
+    return int(state.map.params.count), state.map.params.coords.shape[0]
+
+
 def seen_points(
     frame: Frame, camera: Camera, T_world_cam: Float[np.ndarray, "4 4"], *, step: int = 16
 ) -> Float[np.ndarray, "n 3"]:
