@@ -73,6 +73,8 @@ def test_what_is_given_back_stays_as_it_was():
     np.testing.assert_array_equal(np.asarray(x), np.repeat([7.0, 0.0], [5, 59])[:, None] * np.ones(4096))
     added = jax.jit(lambda x: x.at[40].add(1.0), donate_argnums=0)(x)
     assert float(added.sum()) == 4096 * 36
+    in_trace = jax.jit(lambda: (give_back_zeros(zeros := jnp.zeros((9, 4096))), zeros)[1])()
+    assert not np.asarray(in_trace).any()
     for small in (jnp.zeros(3), jnp.zeros((1, 2))):  # less than a page
         give_back_zeros(small)
         assert not np.asarray(small).any()

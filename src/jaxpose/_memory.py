@@ -33,18 +33,22 @@ def peak_rss_bytes() -> int:
 def give_back_zeros(zeros: Any, first: int = 0) -> None:
     """Hand pages of zeros to the system, which makes them anew, as zeros, where they are written.
 
-    So an array with room for more than it holds takes the memory of what it holds. On a device, and where
-    the system is not Linux, nothing happens.
+    So an array with room for more than it holds takes the memory of what it holds. Nothing happens to arrays
+    of a GPU or of several devices, while functions are traced, and where the system is not Linux.
 
     Args:
         zeros: An array of JAX.
         first: From this row on it holds nothing but zeros.
     """
-    zeros.block_until_ready()
-    if platform.system() != "Linux" or {device.platform for device in zeros.devices()} != {"cpu"}:
+    from jax.core import Tracer  # slow to load, and results of runs are read without it
+
+    if platform.system() != "Linux" or isinstance(zeros, Tracer):
         return
-    start = zeros.unsafe_buffer_pointer() + first * (zeros.nbytes // len(zeros))
-    start, end = -(-start // mmap.PAGESIZE), (zeros.unsafe_buffer_pointer() + zeros.nbytes) // mmap.PAGESIZE
+    if [device.platform for device in zeros.devices()] != ["cpu"]:
+        return
+    begin = zeros.block_until_ready().unsafe_buffer_pointer()
+    start = -(-(begin + first * (zeros.nbytes // len(zeros))) // mmap.PAGESIZE)
+    end = (begin + zeros.nbytes) // mmap.PAGESIZE
     if start < end:
         pages = ctypes.c_void_p(start * mmap.PAGESIZE), ctypes.c_size_t((end - start) * mmap.PAGESIZE)
         ctypes.CDLL(None).madvise(*pages, ctypes.c_int(mmap.MADV_DONTNEED))
