@@ -16,6 +16,8 @@ from jaxpose.scenes.voxel_blocks import (
     decoded,
     empty_blocks,
     encoded,
+    holds_surface,
+    of_distance_and_colour,
     packed,
     sample_blocks,
     unpacked,
@@ -77,6 +79,17 @@ def test_what_is_free_is_stored_as_zeros():
     assert_allclose(decoded(CONFIG, np.zeros((3, 8), np.int16)), free, atol=1e-4)
     found = sample_blocks(CONFIG, empty_blocks(CONFIG, capacity=8, side=2, bricks=2), jnp.ones(3))
     assert_allclose(found, [0.15, 0.5, 0.5, 0.5, 0, 0], atol=1e-4)
+
+
+def test_a_block_holds_a_surface_where_its_distance_changes_sign():
+    values = np.zeros((5, *[9] * 3, 4), np.float32)
+    values[..., 0] = 0.15
+    values[1, 4, 4, 4, 0] = -1e-5
+    values[2, ..., 0] = -0.15
+    values[3, ..., 0], values[3, 0, 0, 0, 0] = 1e-5, -0.15
+    values[4, ..., 0] = 1e-5
+    stored = of_distance_and_colour(CONFIG, values)
+    assert holds_surface(stored).tolist() == [False, True, False, True, False]
 
 
 def test_a_budget_counts_the_pool_while_it_grows():

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Shaped
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from jaxpose._memory import give_back_zeros
 from jaxpose.scenes.types import SceneField
@@ -134,6 +134,12 @@ def decoded(config: BlockConfig, stored: Int[Any, "*n 8"]) -> Float[Any, "*n 8"]
         join = np.concatenate
     weights = np.float32(MEMORY) * scaled[..., SAMPLED:] ** 2
     return join([scaled[..., :SAMPLED] * _range(config, stored.ndim), weights], axis=-1)
+
+
+def holds_surface(stored: Int[np.ndarray, "n 9 9 9 8"]) -> Bool[np.ndarray, " n"]:
+    """Whether the signed distance of blocks, as `packed` gives them, is on both sides of zero."""
+    distance = stored[..., 0] + _FREE[0]
+    return (distance.min(axis=(1, 2, 3)) < 0) & (distance.max(axis=(1, 2, 3)) > 0)
 
 
 def _range(config: BlockConfig, dimensions: int = 1) -> Float[np.ndarray, "... 5"]:

@@ -1,6 +1,5 @@
 """The files of a SLAM run: trajectory, field, map, point cloud, mesh, pictures."""
 
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -80,10 +79,12 @@ def write_run(
         depth_per_metre=recording.depth_per_metre,
     )
     atomic.write_json(folder / "config.json", options)
-    phase("writing the point cloud and the mesh")
+    phase("writing the point cloud")
+    _write_points(folder / "points.ply", recording, result)
+    phase("writing the mesh")
     world = first_pose(recording).notes if options.map is None else _map_notes(options.map, ground_truth)
     notes = (*recording.notes, *world, *_coarser_notes(options, result))
-    notes = (*notes, *_write_surface(folder, recording, result))
+    notes = (*notes, *_write_mesh(folder / "mesh.ply", recording, result))
     phase("rendering the map")
     render = renderer(recording, result)
     quality = map_quality(result, render)
@@ -149,17 +150,22 @@ def _write_trajectory(folder: Path, source: Source, result: SlamResult) -> None:
     )
 
 
-def _write_surface(folder: Path, recording: Recording, result: SlamResult) -> tuple[str, ...]:
-    """The map as a point cloud and, where scikit-image is installed, as a mesh; a note where it is not."""
-    keyframes = partial(keyframe_images, recording.read, result.keyframes, result.T_world_cam)
-    points = point_cloud(keyframes(), recording.camera, result.map_config.voxel)
-    write_ply(folder / "points.ply", points.points, points.rgb)
+def _write_points(file: Path, recording: Recording, result: SlamResult) -> None:
+    """What the keyframes measured, as a point cloud."""
+    keyframes = keyframe_images(recording.read, result.keyframes, result.T_world_cam)
+    points = point_cloud(keyframes, recording.camera, result.map_config.voxel)
+    write_ply(file, points.points, points.rgb)
+
+
+def _write_mesh(file: Path, recording: Recording, result: SlamResult) -> tuple[str, ...]:
+    """The map as a mesh, where scikit-image is installed; a note where it is not."""
+    keyframes = keyframe_images(recording.read, result.keyframes, result.T_world_cam)
+    blocks, earlier = result.scene_params[0], 0 if result.earlier is None else len(result.earlier.coords)
     try:
-        blocks, earlier = result.scene_params[0], 0 if result.earlier is None else len(result.earlier.coords)
-        surface = mesh(result.map_config, blocks, keyframes(), recording.camera, earlier)
+        surface = mesh(result.map_config, blocks, keyframes, recording.camera, earlier)
     except ImportError:
         return ('no mesh.ply: pip install -e ".[mesh]" for marching cubes',)
-    write_ply(folder / "mesh.ply", surface.points, surface.rgb, surface.faces)
+    write_ply(file, surface.points, surface.rgb, surface.faces)
     return ()
 
 

@@ -11,11 +11,18 @@ from scipy.ndimage import map_coordinates
 
 from jaxpose.geometry import se3
 from jaxpose.geometry.camera import Camera
-from jaxpose.scenes.voxel_blocks import CELLS, SAMPLED, BlockConfig, Blocks, decoded, packed
+from jaxpose.scenes.voxel_blocks import CELLS, SAMPLED, BlockConfig, Blocks, decoded, holds_surface, packed
 from jaxpose.slam.keyframes import Keyframe
 from jaxpose.slam.observation import back_project, locate, read_pixels
 
 _PENDING = 1_000_000  # points
+_EMPTY = (
+    np.zeros((0, 3)),
+    np.zeros((0, 3), np.float32),
+    np.zeros(0, bool),
+    np.zeros(0, bool),
+    np.zeros((0, 3), int),
+)
 
 
 class Surface(NamedTuple):
@@ -78,29 +85,21 @@ def mesh(
     from skimage.measure import marching_cubes
 
     coords, stored = packed(blocks)
-    corners, triangles, colours, known, before, count = (
-        [np.zeros((0, 3))],
-        [np.zeros((0, 3), np.int64)],
-        [np.zeros((0, 3))],
-        [np.zeros(0, bool)],
-        [np.zeros(0, bool)],
-        0,
-    )
-    distance = stored[..., 0]
-    crossed = np.flatnonzero((distance.min(axis=(1, 2, 3)) < 0) & (distance.max(axis=(1, 2, 3)) > 0))
-    for row in crossed.tolist():
+    parts, count = list[tuple[np.ndarray, ...]]([_EMPTY]), 0
+    for row in np.flatnonzero(holds_surface(stored)).tolist():
         block, nodes = coords[row], decoded(config, stored[row])
         # In skimage's words the triangles' front then faces growing distances: free space.
         cells, faces, _, _ = marching_cubes(nodes[..., 0], level=0.0, gradient_direction="descent")
         rgb = [map_coordinates(nodes[..., k], cells.T, order=1, mode="nearest") for k in (1, 2, 3)]
         ends = (tuple(end(cells).astype(int).T) for end in (np.floor, np.ceil))
-        known.append(np.all([nodes[end][:, SAMPLED] > 0 for end in ends], axis=0))
-        before.append(np.full(len(cells), row < earlier))
-        corners.append(CELLS * block + cells.astype(np.float64))
-        colours.append(np.stack(rgb, axis=-1))
-        triangles.append(faces + count)
+        known = np.all([nodes[end][:, SAMPLED] > 0 for end in ends], axis=0)
+        corners = CELLS * block + cells.astype(np.float64)
+        parts.append(
+            (corners, np.stack(rgb, axis=-1), known, np.full(len(cells), row < earlier), faces + count)
+        )
         count += len(cells)
-    cells, rgb, known, before, faces = map(np.concatenate, (corners, colours, known, before, triangles))
+    cells, rgb, known, before, faces = map(np.concatenate, zip(*parts, strict=True))
+    del parts
     # Blocks share their outer nodes, and so the corners between them.
     place = _cubes(cells - np.min(cells, axis=0, initial=np.inf), 1 / 64)
     _, first, which = np.unique(place, return_index=True, return_inverse=True)
