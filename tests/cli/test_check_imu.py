@@ -185,3 +185,10 @@ def test_readings_a_century_apart_take_no_more_room_than_others(tmp_path):
     lines = file.read_text().splitlines()
     file.write_text("\n".join([*lines, "4500000000000000000," + lines[-1].split(",", 1)[1]]))
     assert "gaps" in " ".join(checked(folder).notes) + faults(checked(folder))
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_poses_that_are_too_few_to_test_readings_are_told(tmp_path, count):
+    file = euroc(tmp_path) / "mav0/state_groundtruth_estimate0/data.csv"
+    file.write_text("\n".join(file.read_text().splitlines()[: 1 + count]) + "\n")
+    assert "overlap too little with the IMU" in " ".join(checked(tmp_path).notes)

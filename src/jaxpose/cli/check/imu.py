@@ -141,6 +141,8 @@ def _gravity(imu: Imu, t: Float[np.ndarray, " n"], T_world_imu: Float[np.ndarray
 
 def _match(imu: Imu, t: Float[np.ndarray, " n"], T: Float[np.ndarray, "n 4 4"]) -> _Match | None:
     """Mean body rates over windows between poses against means of the readings, at every clock offset."""
+    if len(t) < 2:
+        return None
     rows = slice(None, None, max(1, round(_WINDOW_S / float(np.median(np.diff(t))))))
     t, R, at = t[rows], Rotation.from_matrix(T[rows, :3, :3]), np.asarray(imu.t)
     step = np.diff(t)
