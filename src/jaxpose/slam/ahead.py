@@ -101,21 +101,12 @@ def compile_growth(state: SlamState, used: int, image: Image, expected: MotionPr
         return
     resized = lambda x: jax.ShapeDtypeStruct((larger, *x.shape[1:]), x.dtype)
     blocks = state.map.params
-    grown = state.map._replace(
-        params=blocks._replace(coords=resized(blocks.coords), values=resized(blocks.values))
-    )
+    blocks = blocks._replace(coords=resized(blocks.coords), values=resized(blocks.values))
+    grown = state.map._replace(params=blocks)
     problem = tracking_problem(state, state.frames, expected, np.random.default_rng(0))
-    tracked = (
-        grown.params,
-        grown.fusion_state,
-        state.params,
-        problem,
-        image,
-        jnp.float32(0),
-        jax.random.key(0),
-    )
+    seen = state.params, problem, image, jnp.float32(0), jax.random.key(0)
     _begin([
-        (backend.track, *tracked),
+        (backend.track, grown.params, grown.fusion_state, *seen),
         (backend.update, grown, image, jnp.zeros((4, 4), jnp.float32)),
         (backend.relocalise, *_search_arguments(grown, image)),
     ])  # fmt: skip
@@ -127,11 +118,13 @@ def _search_arguments(state: MapState, image: Image) -> tuple[Any, ...]:
 
 
 def _begin(calls: list[tuple[Any, ...]]) -> None:
-    """Compile functions for such arguments in a thread."""
+    """Compile functions for such arguments in a thread, unless the program ends meanwhile."""
     shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), [args for _, *args in calls])
 
     def work() -> None:  # the arguments themselves may be donated meanwhile
         for (function, *_), args in zip(calls, shapes, strict=True):
+            if not threading.main_thread().is_alive():
+                return  # nobody is left to need it
             with suppress(Exception):
                 function.lower(*args).compile()
             give_back_memory()
