@@ -74,6 +74,11 @@ def test_a_checkpoint_holds_the_whole_state(method, tmp_path):
     np.testing.assert_array_equal(found.thumbnails, state.thumbnails)
     with pytest.raises(DataError, match="c.npz: expected a run over frames at the times of"):
         checkpoint.load(tmp_path / "c.npz", recording._replace(t=recording.t + 0.1), config)
+    with np.load(tmp_path / "c.npz") as file:
+        older = {name: value for name, value in file.items() if "version" not in name}
+    np.savez(tmp_path / "c.npz", **older)
+    with pytest.raises(DataError, match=r"c.npz: expected a checkpoint of version 2, got none"):
+        checkpoint.load(tmp_path / "c.npz", recording, config)
     (tmp_path / "c.npz").write_bytes(b"PK\3\4 not a checkpoint")
     with pytest.raises(DataError, match="c.npz: expected a checkpoint"):
         checkpoint.load(tmp_path / "c.npz", recording, config)

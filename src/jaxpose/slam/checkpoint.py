@@ -11,7 +11,7 @@ import numpy as np
 from jaxpose.datasets.types import Recording
 from jaxpose.errors import DataError
 from jaxpose.files import checkpoint as checkpoint_file
-from jaxpose.files.schema import numbers, rigid_transforms
+from jaxpose.files.schema import check_version, numbers, rigid_transforms
 from jaxpose.files.untrusted import read_npz, reading
 from jaxpose.imu import Imu
 from jaxpose.scenes import GridConfig
@@ -24,6 +24,7 @@ from jaxpose.slam.tracking.features import detect
 from jaxpose.slam.types import SlamState, TrackingStatus, no_frames
 
 _NUMBERS = "max_depth", "duration_s", "settled", "imu_offset_s", "passes"  # stored as arrays
+_VERSION = 2  # of how a map is stored
 _FASTEST = 1e6  # [m/s, rad/s, m]
 
 
@@ -40,6 +41,7 @@ def load(path: Path | str, recording: Recording, config: SlamConfig) -> SlamStat
     """
     kind = BlockConfig if config.map.method == "fused" else GridConfig
     file = read_npz(path, "a checkpoint")
+    check_version(path, {"version": file.get("['version']", "none")}, _VERSION, "a checkpoint")
     with reading(path, "a checkpoint"):
         size = {name: file[f"['grid']['{name}']"].tolist() for name in asdict(kind())}
         count = {name: len(file[f"['state'].{name}"]) for name in ("frames.t", "thumbnails")}
@@ -122,4 +124,5 @@ def _as_arrays(state: SlamState, size: dict[str, Any], blocks: int | None = None
         if blocks is not None:
             rows = tuple(np.zeros((blocks, *x.shape[1:]), x.dtype) for x in rows)
         state = state._replace(map=state.map._replace(params=rows))
-    return {"state": state, "grid": {name: np.asarray(value) for name, value in size.items()}}
+    grid = {name: np.asarray(value) for name, value in size.items()}
+    return {"version": np.asarray(_VERSION), "state": state, "grid": grid}
