@@ -46,3 +46,5 @@ def test_a_file_is_read_as_it_is(tmp_path):
         assert stream.size == 16000 and stream.read(3) == b"\xef\xbb\xbf"
         assert len(stream.read(1 << 60)) == 16000 - 3  # without space for all of that
         assert stream.read(1 << 60) == b"" and stream.read() == b""
+        stream.seek(1)
+        assert stream.read(3) == b"\xbb\xbfa" and stream.read() == path.read_bytes()[4:]

@@ -170,7 +170,7 @@ def npy(random: Random, content: bytes) -> bytes:
     return _header(random, content)
 
 
-def _members(content: bytes) -> dict[str, bytes] | None:
+def members_of(content: bytes) -> dict[str, bytes] | None:
     """The files of an archive by their names; None for one that is damaged already."""
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
@@ -190,7 +190,7 @@ def _archive(random: Random, members: dict[str, bytes], compression: int) -> byt
 
 def npz(random: Random, content: bytes) -> bytes:
     """Arrays replaced, left out, renamed, with headers that lie; pickled, stored or deflated."""
-    members = _members(content)
+    members = members_of(content)
     if members is None:
         return anywhere(random, content)
     for _ in range(random.choice((1, 1, 2))):
@@ -244,7 +244,7 @@ def hdf5(random: Random, content: bytes) -> bytes:
 
 def zipped(random: Random, content: bytes) -> bytes:
     """Members of an archive damaged, left out, renamed."""
-    members = _members(content)
+    members = members_of(content)
     if members is None:
         return anywhere(random, content)
     name = random.choice(list(members)) if random.random() < 0.5 else min(members)

@@ -13,7 +13,6 @@ import os, signal, sys, tempfile
 from pathlib import Path
 sys.path[:0] = [sys.argv[1], str(Path(sys.argv[1]).parent)]
 import run, targets
-count = 0
 with tempfile.TemporaryDirectory() as where:
     for name, target in targets.TARGETS.items():
         folder = Path(where) / name

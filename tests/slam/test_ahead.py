@@ -21,6 +21,13 @@ from jaxpose.slam.types import TrackingStatus, no_frames
 OWN = np.repeat([0.004, 0.003], 3)
 
 
+def compiled_ahead():
+    """Wait for what threads are compiling."""
+    for thread in threading.enumerate():
+        if thread.name == "compile ahead":
+            thread.join()
+
+
 def test_a_run_s_end_is_compiled_while_it_tracks(compiled):
     """By the recording alone, whatever frames are lost; not for a run without an IMU, nor after an error."""
     t = 1.7e9 + np.arange(30) / 4
@@ -56,9 +63,7 @@ def test_the_search_is_there_before_a_frame_is_in_doubt(compiled):
     recording = room(RoomConfig(duration_s=1.0, width=64, height=48))
     state = slam.init(recording.camera, slam.SlamConfig(imu="none", voxel=0.11, features="none"))
     state = slam.step(state, *recording.read(0), recording.t[0])
-    for thread in threading.enumerate():
-        if thread.name == "compile ahead":
-            thread.join()
+    compiled_ahead()
     assert "search" in compiled()
     assert not state.frames.lost[0]
     search = map_backend(state).relocalise
@@ -77,9 +82,7 @@ def test_no_frame_waits_for_a_larger_pool(compiled, monkeypatch):
     for i, t in enumerate(recording.t):
         state = slam.step(state, *recording.read(i), t)
         sizes.append(pool_size(state)[1])
-        for thread in threading.enumerate():
-            if thread.name == "compile ahead":
-                thread.join()
+        compiled_ahead()
         at.append(compiled())
         if sizes[-1] == 472:
             break

@@ -123,15 +123,15 @@ def encoded(config: BlockConfig, values: Float[Array, "*n 8"]) -> Int[Array, "*n
     scaled = jnp.concatenate([values[..., :SAMPLED] / _range(config, values.ndim), weights], axis=-1)
     whole = jnp.round(_WHOLE * jnp.clip(scaled, -1, 1))
     least = jnp.concatenate([jnp.full_like(whole[..., :SAMPLED], -_WHOLE), jnp.sign(weights)], axis=-1)
-    return jnp.maximum(whole, least).astype(jnp.int16) - _free(whole.ndim)  # what has a weight keeps one
+    return jnp.maximum(whole, least).astype(jnp.int16) - _along_last(
+        _FREE, whole.ndim
+    )  # what has a weight keeps one
 
 
 def decoded(config: BlockConfig, stored: Int[Any, "*n 8"]) -> Float[Any, "*n 8"]:
     """The channels of nodes that `encoded` has made, float32; arrays stay where they are."""
-    scaled = (stored + _free(stored.ndim)).astype(np.float32) / np.float32(_WHOLE)
-    join = jnp.concatenate
-    if isinstance(stored, np.ndarray):
-        join = np.concatenate
+    scaled = (stored + _along_last(_FREE, stored.ndim)).astype(np.float32) / np.float32(_WHOLE)
+    join = np.concatenate if isinstance(stored, np.ndarray) else jnp.concatenate
     weights = np.float32(MEMORY) * scaled[..., SAMPLED:] ** 2
     return join([scaled[..., :SAMPLED] * _range(config, stored.ndim), weights], axis=-1)
 
@@ -145,7 +145,12 @@ def holds_surface(stored: Int[np.ndarray, "n 9 9 9 8"]) -> Bool[np.ndarray, " n"
 def _range(config: BlockConfig, dimensions: int = 1) -> Float[np.ndarray, "... 5"]:
     """The largest value of each sampled channel that the pool holds, along the last of some dimensions."""
     largest = np.array([config.truncation, 2, 2, 2, CELLS * config.voxel], np.float32)
-    return largest.reshape((1,) * (dimensions - 1) + (SAMPLED,))
+    return _along_last(largest, dimensions)
+
+
+def _along_last(row: Shaped[np.ndarray, " k"], dimensions: int) -> Shaped[np.ndarray, "... k"]:
+    """A row along the last of some dimensions."""
+    return row.reshape((1,) * (dimensions - 1) + (-1,))
 
 
 def sample_blocks(config: BlockConfig, blocks: Blocks, point: Float[Array, "3"]) -> Float[Array, "6"]:
@@ -278,11 +283,6 @@ def _room_for(count: int, room: int, most: float = np.inf) -> int:
     return room
 
 
-def _free(dimensions: int) -> Int[np.ndarray, "... 8"]:
-    """`_FREE` along the last of some dimensions."""
-    return _FREE.reshape((1,) * (dimensions - 1) + (CHANNELS,))
-
-
 def _free_rows(capacity: int) -> Int[Array, "c n n n k"]:
     """A pool of free rows, that takes memory as they are used."""
     rows = jnp.zeros((capacity, NODES, NODES, NODES, CHANNELS), jnp.int16)
@@ -309,11 +309,9 @@ def _enlarged(values: Int[Array, "c n n n k"], capacity: int) -> Int[Array, "d n
 
 
 @partial(jax.jit, donate_argnums=0)
-def with_first_rows(
-    pool: Int[Array, "c 9 9 9 8"], values: Int[Array, "n 9 9 9 8"]
-) -> Int[Array, "c 9 9 9 8"]:
-    """The pool with its first rows behind the empty one as they were, in the same memory."""
-    return pool.at[1 : len(values) + 1].set(values)
+def with_first_rows(blocks: Blocks, values: Int[Array, "n 9 9 9 8"]) -> Blocks:
+    """The blocks with the first rows behind the empty one as they were, in the same memory."""
+    return blocks._replace(values=blocks.values.at[1 : len(values) + 1].set(values))
 
 
 def packed(blocks: Blocks) -> tuple[Int[np.ndarray, "n 3"], Int[np.ndarray, "n 9 9 9 8"]]:
@@ -330,7 +328,7 @@ def unpacked(
     if not len(coords):
         return blocks
     blocks = with_blocks(config, blocks, np.asarray(coords, np.int64))
-    return blocks._replace(values=with_first_rows(blocks.values, jnp.asarray(values)))
+    return with_first_rows(blocks, jnp.asarray(values))
 
 
 def blocks_of_grid(config: GridConfig, values: Float[np.ndarray, "x y z 4"]) -> tuple[BlockConfig, Blocks]:

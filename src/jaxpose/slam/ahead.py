@@ -94,11 +94,14 @@ def compile_growth(state: SlamState, used: int, image: Image, expected: MotionPr
         image: of that frame.
         expected: of its motion.
     """
-    assert state.map is not None
-    backend, capacity = map_backend(state), pool_size(state)[1]
-    larger = next_capacity(capacity, state.config.map_budget)
-    if not used < _NEARLY_FULL * capacity <= pool_size(state)[0] or larger is None:
+    now, capacity = pool_size(state)
+    if not used < _NEARLY_FULL * capacity <= now:
         return
+    larger = next_capacity(capacity, state.config.map_budget)
+    if larger is None:
+        return
+    assert state.map is not None
+    backend = map_backend(state)
     resized = lambda x: jax.ShapeDtypeStruct((larger, *x.shape[1:]), x.dtype)
     blocks = state.map.params
     blocks = blocks._replace(coords=resized(blocks.coords), values=resized(blocks.values))

@@ -29,6 +29,7 @@ from jaxpose.files.schema import FARTHEST_M, may_exist, name_inside
 from jaxpose.files.tables import seconds
 from jaxpose.geometry.camera import Camera, resized
 
+_DRIVE = re.compile(r"[A-Za-z]:")  # that a name may begin with
 _SAME_SHAPE = 0.02  # of width by height, for images of one view in two sizes
 
 
@@ -146,11 +147,8 @@ class Listing:
 
 def _listed_file(where: Path | str, listing: Listing, name: str) -> Path | None:
     """The file of a name in a list; of one that was absolute on another machine by the last parts of it."""
-    first = name.partition("/")[0]
-    if first and "\\" not in name and ":" not in first:
-        return listing.find(name_inside(where, name))
-    parts = re.split(r"[/\\]", name)
-    if parts[0] and not re.fullmatch(r"[A-Za-z]:", parts[0]):
+    parts = name.replace("\\", "/").split("/")
+    if parts[0] and not _DRIVE.fullmatch(parts[0]):
         return listing.find(name_inside(where, name))
     tails = ("/".join(parts[k:]) for k in range(1, len(parts)))
     files = (listing.find(name_inside(where, tail)) for tail in tails)

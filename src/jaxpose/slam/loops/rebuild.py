@@ -54,7 +54,7 @@ def rebuilt(
     if earlier is not None:
         assert isinstance(state.grid, BlockConfig)
         begun = with_blocks(state.grid, begun, earlier.coords.astype(np.int64))
-        begun = begun._replace(values=with_first_rows(begun.values, jnp.asarray(earlier.values)))
+        begun = with_first_rows(begun, jnp.asarray(earlier.values))
     return resumed(state._replace(map=MapState(begun, ()), pending=chosen), read, at_once)
 
 
