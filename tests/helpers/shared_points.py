@@ -19,14 +19,27 @@ def around(count: int, radius: float = 4.0, degrees: float = 360.0) -> np.ndarra
     return rigid.make(np.stack([right, np.cross(forward, right), forward], axis=-1), centre)
 
 
-def seen(T: np.ndarray, points: np.ndarray, random, noise_px: float = 0.0, wrong: float = 0.0, share=0.6):
-    """Tracks of points, each in a share of the cameras; some of the matches lead anywhere."""
+def seen(
+    T: np.ndarray,
+    points: np.ndarray,
+    random,
+    noise_px: float = 0.0,
+    wrong: float = 0.0,
+    share=0.6,
+    aligned=0.0,
+):
+    """Tracks of points, each in a share of the cameras; some of the matches lead anywhere.
+
+    Some are aligned, and ten times less off.
+    """
     view, point = np.nonzero(random.random((len(T), len(points))) < share)
     at = np.einsum("oji,oj->oi", T[view, :3, :3], points[point] - T[view, :3, 3])
-    xy = at[:, :2] / at[:, 2:] + random.normal(0, noise_px / FOCAL, (len(view), 2))
+    is_aligned = random.random(len(view)) < aligned if aligned else np.zeros(len(view), bool)
+    sigma = np.where(is_aligned, 0.1, 1.0)[:, None] * noise_px / FOCAL
+    xy = at[:, :2] / at[:, 2:] + sigma * random.normal(0, 1, (len(view), 2))
     lost = random.random(len(view)) < wrong
     xy[lost] = random.uniform(-0.3, 0.3, (lost.sum(), 2))
-    return Tracks(view, point, xy, len(T), FOCAL)
+    return Tracks(view, point, xy, len(T), FOCAL, is_aligned)
 
 
 def disturbed(T: np.ndarray, random, metres: float, radians: float) -> np.ndarray:

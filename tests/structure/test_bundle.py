@@ -55,6 +55,19 @@ def test_against_scipy():
     assert (residual(ours) ** 2).sum() < 1.005 * (best.fun**2).sum()
 
 
+def test_aligned_observations_count_as_they_are_surer():
+    """Four in ten are ten times less off, which is found: better than taking all for alike."""
+    off = {True: [], False: []}
+    for seed in range(5):
+        random = np.random.default_rng(seed)
+        T, points = around(12, degrees=180), random.uniform(-1, 1, (60, 3))
+        tracks = seen(T, points, random, noise_px=0.5, aligned=0.4)
+        for told in off:
+            told_so = tracks._replace(aligned=tracks.aligned & told)
+            off[told].append(pose_errors(adjust(told_so, T, depth=4.0).T_world_cam, T).rotation_deg)
+    assert np.median(off[True]) < 0.7 * np.median(off[False])
+
+
 def test_all_cameras_may_start_in_one_place():
     """As for photographs without poses: a forward-facing scene; the depth settles the scale."""
     random = np.random.default_rng(2)

@@ -37,10 +37,16 @@ def test_photographs_that_pairs_do_not_tie_are_left_out():
     T, points = around(12), random.uniform(-1, 1, (80, 3))
     tracks = seen(T, points, random, share=0.9)
     kept = (tracks.view < 9) == (tracks.point < 60)  # nine see some points, the others the rest
-    tracks = tracks._replace(view=tracks.view[kept], point=tracks.point[kept], xy_cam=tracks.xy_cam[kept])
+    tracks = tracks._replace(
+        view=tracks.view[kept],
+        point=tracks.point[kept],
+        xy_cam=tracks.xy_cam[kept],
+        aligned=tracks.aligned[kept],
+    )
     found, tied = global_poses(tracks)
     np.testing.assert_array_equal(tied, np.arange(12) < 9)
     np.testing.assert_array_equal(found[9:], np.tile(np.eye(4), (3, 1, 1)))
     assert pose_errors(found[:9], T[:9]).rotation_deg < 0.1
-    none = tracks._replace(view=np.zeros(0, int), point=np.zeros(0, int), xy_cam=np.zeros((0, 2)))
+    no, nothing = np.zeros(0, int), np.zeros(0, bool)
+    none = tracks._replace(view=no, point=no, xy_cam=np.zeros((0, 2)), aligned=nothing)
     assert not global_poses(none)[1].any()

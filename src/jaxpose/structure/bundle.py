@@ -28,6 +28,7 @@ _FEWEST_TIED = 4  # photographs
 _NARROWER = 3.0  # times the loss, from stage to stage
 _LEAST_NOISE = 0.05  # [px]
 _WIDE = 90  # [%] of the errors at the start, that the loss begins with
+_WEIGHINGS, _WEIGHED = 5, 0.05  # at most so many, and the share by which weights have to change
 _STEPS, _SETTLED = 15, 1e-3  # of a stage: at most so many, and the share by which its loss has to fall
 _MEDIAN_LENGTH = 1.177  # of a vector in the plane, normal in both directions, in sigmas
 _NEAREST = 1e-2  # of the usual depth, in front of a camera
@@ -51,6 +52,8 @@ class _Problem(NamedTuple):
     view: Int[np.ndarray, " o"]  # in order
     point: Int[np.ndarray, " o"]
     xy: Float[np.ndarray, "o 2"]
+    aligned: Bool[np.ndarray, " o"]
+    weight: Float[np.ndarray, " o"]  # how many times surer than others, in sigmas
     focal: float
     nearest: float  # depth in front of a camera
     by_view: sp.csr_matrix  # (n, o), sums over the observations of each view
@@ -58,7 +61,7 @@ class _Problem(NamedTuple):
 
 
 class _Errors(NamedTuple):
-    """Reprojection errors [px]; infinite behind a camera."""
+    """Reprojection errors, times their weights [px]; infinite behind a camera."""
 
     point_cam: Float[np.ndarray, "o 3"]
     residual: Float[np.ndarray, "o 2"]
@@ -102,7 +105,9 @@ def adjust(
         return None
     found = [_solution(problem, T, depth, on_step) for T in _starts(problem, T_start, depth)]
     width = _OUTLIER * min(each.sigma for each in found)
-    T, points, errors, sigma = min(found, key=lambda each: _loss(each.errors, width))
+    best = min(found, key=lambda each: _loss(each.errors, width))
+    problem, best = _weighed(problem, best, depth, on_step)
+    T, points, errors, sigma = best
     agree = errors.size < _OUTLIER * sigma
     supported = np.asarray(problem.by_view @ agree.astype(np.float64)) >= _FEWEST
     if supported.sum() < max(_FEWEST_TIED, len(T) / 2):
@@ -114,8 +119,11 @@ def adjust(
     place = to_start.apply(points[seen])
     depths = to_start.scale * errors.point_cam[agree, 2]
     right = _of_some(_tracks(problem, len(T)), np.flatnonzero(agree), problem.nearest)
+    right = right._replace(weight=problem.weight[agree])
     at_start = _reproject(right, T_start, _start_points(right, T_start, depth)).size
-    return Bundle(moved, supported, place, depths, sigma, float(np.mean(at_start < _OUTLIER * sigma)))
+    size = errors.size[agree]
+    noise = sigma * float(np.median(size / problem.weight[agree]) / max(np.median(size), 1e-12))
+    return Bundle(moved, supported, place, depths, noise, float(np.mean(at_start < _OUTLIER * sigma)))
 
 
 def _solution(
@@ -137,6 +145,34 @@ def _solution(
         if narrower > 0.9 * sigma:
             return _Solution(T, points, errors, sigma)
         sigma = narrower
+
+
+def _weighed(
+    problem: _Problem, solution: _Solution, depth: float, on_step: Callable[[float, float], None]
+) -> tuple[_Problem, _Solution]:
+    """The same where aligned observations count as they are surer, until both agree."""
+    for _ in range(_WEIGHINGS):
+        weight = _weights(problem, solution)
+        if np.allclose(weight, problem.weight, rtol=_WEIGHED):
+            break
+        problem = problem._replace(weight=weight)
+        solution = _solution(problem, solution.T, depth, on_step)
+    return problem, solution
+
+
+def _weights(problem: _Problem, solution: _Solution) -> Float[np.ndarray, " o"]:
+    """How sure aligned observations are beside others, by the median errors of both that agree."""
+    agree = solution.errors.size < _OUTLIER * solution.sigma
+    # What a point's own three numbers have taken off its errors: the more, the fewer tell where it is.
+    square = problem.weight**2 * agree
+    share = square / np.maximum((problem.by_point @ square)[problem.point], 1e-12)
+    left = np.sqrt(np.maximum(1 - 1.5 * share, 0.25))
+    size = solution.errors.size / problem.weight / left
+    aligned, others = (size[agree & which] for which in (problem.aligned, ~problem.aligned))
+    if min(len(aligned), len(others)) < _FEWEST:
+        return np.ones(len(size))
+    ratio = np.median(others) / max(float(np.median(aligned)), _LEAST_NOISE / 4)
+    return np.where(problem.aligned, ratio, 1.0)
 
 
 def _apart(T: Float[np.ndarray, "n 4 4"], depth: float) -> bool:
@@ -162,11 +198,13 @@ def _of_some(tracks: Tracks, kept: np.ndarray, nearest: float) -> _Problem:
     """Some of the observations, in order of their views; points are numbered anew."""
     view, (_, point) = tracks.view[kept], np.unique(tracks.point[kept], return_inverse=True)
     by_view, by_point = sums(view, tracks.views), sums(point, int(point.max()) + 1)
-    return _Problem(view, point, tracks.xy_cam[kept], tracks.focal, nearest, by_view, by_point)
+    aligned, weight = tracks.aligned[kept], np.ones(len(kept))
+    xy, focal = tracks.xy_cam[kept], tracks.focal
+    return _Problem(view, point, xy, aligned, weight, focal, nearest, by_view, by_point)
 
 
 def _tracks(problem: _Problem, views: int) -> Tracks:
-    return Tracks(problem.view, problem.point, problem.xy, views, problem.focal)
+    return Tracks(problem.view, problem.point, problem.xy, views, problem.focal, problem.aligned)
 
 
 def _starts(
@@ -205,7 +243,8 @@ def _reproject(problem: _Problem, T: Float[np.ndarray, "n 4 4"], points: Float[n
     point_cam = np.einsum("oji,oj->oi", T[problem.view, :3, :3], away)
     front = point_cam[:, 2] > problem.nearest
     depth = np.where(front, point_cam[:, 2], 1.0)
-    residual = problem.focal * (point_cam[:, :2] / depth[:, None] - problem.xy)
+    scale = (problem.focal * problem.weight)[:, None]
+    residual = scale * (point_cam[:, :2] / depth[:, None] - problem.xy)
     residual[~front] = 0
     return _Errors(point_cam, residual, np.where(front, np.linalg.norm(residual, axis=1), np.inf))
 
@@ -260,7 +299,7 @@ def _normal_equations(
     weight = np.where(front, 1 / (1 + ratio) ** 2, 0) / width**2
     x, y, z = np.where(front[:, None], errors.point_cam, 1.0).T
     zero = np.zeros_like(z)
-    by_cam = problem.focal * np.stack(
+    by_cam = (problem.focal * problem.weight)[:, None, None] * np.stack(
         [np.stack([1 / z, zero, -x / z**2], -1), np.stack([zero, 1 / z, -y / z**2], -1)], 1
     )  # of the residual by the point in camera axes
     by_point = np.einsum("oij,okj->oik", by_cam, T[problem.view, :3, :3])

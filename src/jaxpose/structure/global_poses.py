@@ -46,7 +46,13 @@ def global_poses(tracks: Tracks) -> tuple[Float[np.ndarray, "n 4 4"], Bool[np.nd
     )
     rotations = _averaged(pairs, int(tied.sum()))
     _, point = np.unique(tracks.point[seen], return_inverse=True)
-    inner = Tracks(new[tracks.view[seen]], point, tracks.xy_cam[seen], int(tied.sum()), tracks.focal)
+    inner = tracks._replace(
+        view=new[tracks.view[seen]],
+        point=point,
+        xy_cam=tracks.xy_cam[seen],
+        views=int(tied.sum()),
+        aligned=tracks.aligned[seen],
+    )
     T[tied] = rigid.make(rotations, _places(inner, rotations))
     return T, tied
 

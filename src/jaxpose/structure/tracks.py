@@ -2,7 +2,8 @@
 
 Blobs of the three colour channels, described by SIFT (Lowe 2004; square roots of histograms, Arandjelovic
 and Zisserman 2012), matched by the ratio test in both directions, kept where an essential matrix explains
-them (Nister 2004, RANSAC). Detection, description and RANSAC (its USAC) are OpenCV's.
+them (Nister 2004, RANSAC), moved to where their patches agree. Detection, description and RANSAC (its USAC)
+are OpenCV's.
 """
 
 from collections.abc import Callable
@@ -13,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from jaxpose.geometry.camera import Camera, unproject_numpy
+from jaxpose.structure.patches import align_patches
 
 FEWEST = 15  # matches of two photographs that are believed: at random, five and a few more agree now and then
 
@@ -35,6 +37,7 @@ class Tracks(NamedTuple):
     xy_cam: Float[np.ndarray, "o 2"]  # where it is seen, on the plane z = 1 of the camera, without distortion
     views: int
     focal: float  # [px]
+    aligned: Bool[np.ndarray, " o"]  # where it is seen is known by its patch: to a fraction of others' error
 
     @property
     def points(self) -> int:
@@ -79,13 +82,14 @@ def find_tracks(
         found += [(d, i, a, j, b) for d, (a, b) in both]
         on_step("pairs", done + 1, len(pairs))
     view, feature, point = _joined(sorted(found), [len(each.pixel) for each in features])
-    xy = np.array([directions[v][f] for v, f in zip(view, feature, strict=True)]).reshape(-1, 2)
-    return Tracks(view, point, xy, len(rgb), focal)
+    pixel = np.array([features[v].pixel[f] for v, f in zip(view, feature, strict=True)]).reshape(-1, 2)
+    placed = align_patches(rgb, view, point, pixel, _enlarged(rgb[0]))
+    return Tracks(view, point, unproject_numpy(camera, placed.pixel)[:, :2], len(rgb), focal, placed.found)
 
 
 def _detect(image: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"] | None) -> _Features:
     """The strongest features of the three channels: grey would miss what is seen by its colour alone."""
-    scale = 2 if min(image.shape[:2]) < _SMALL_PX else 1
+    scale = _enlarged(image)
     size = image.shape[1] * scale, image.shape[0] * scale
     counts = (
         None if mask is None else cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
@@ -107,6 +111,10 @@ def _detect(image: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"] | N
         descriptor.append(np.concatenate([np.sqrt(histogram / total), channels], axis=1) / np.sqrt(2))
     order = np.argsort(-np.concatenate(response), kind="stable")[:_MOST]
     return _Features(np.concatenate(pixel)[order], np.concatenate(descriptor)[order].astype(np.float32))
+
+
+def _enlarged(image: UInt8[np.ndarray, "h w 3"]) -> int:
+    return 2 if min(image.shape[:2]) < _SMALL_PX else 1
 
 
 def _pairs(rgb: UInt8[np.ndarray, "n h w 3"]) -> list[tuple[int, int]]:

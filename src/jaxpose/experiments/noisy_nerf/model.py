@@ -14,11 +14,9 @@ from scipy.interpolate import make_splrep
 
 from jaxpose import fields, scenes
 from jaxpose.datasets.types import Photographs
-from jaxpose.errors import DataError
-from jaxpose.experiments import training_loop
 from jaxpose.experiments.noisy_nerf.options import ORBIT, Config, Problem
 from jaxpose.experiments.noisy_nerf.registration import Registered
-from jaxpose.experiments.training_loop import CHUNK, Trained
+from jaxpose.experiments.training_loop import CHUNK
 from jaxpose.fields import PoseField, PoseNetConfig
 from jaxpose.scenes import NerfConfig, PlanesConfig, SceneField, nerf, with_occupancy
 from jaxpose.training.photometric import Depths, Sampler, TrainConfig, Views, importance, trainer
@@ -127,22 +125,6 @@ def build(config: Config, problem: Problem, registered: Registered | None = None
     )
 
 
-def initial_state(config: Config, problem: Problem, model: Model, registered: Registered | None) -> Trained:
-    """A training at its start: a PoseNet that begins at the given poses is brought to those registered."""
-    trained = training_loop.initial_state(model, config.seed)
-    if registered is None or not _from_given_poses(config):
-        return trained
-    known = registered.supported
-    goal = problem.train.t[known], registered.T_world_cam[known]
-    # A move as long as scenes are far away is as large as a turn.
-    lengths = min((registered.near * registered.far) ** 0.5, 10 * registered.near)
-    try:
-        found = fields.fit(model.field, *goal, params=trained.state.pose, length_scale=lengths)
-    except ValueError as error:
-        raise DataError(f"{config.data}: poses by features: {error}") from None
-    return trained._replace(state=trained.state._replace(pose=found.params))
-
-
 def _perceptron(config: Config, problem: Problem) -> _Preset:
     """NeRF's network, which registers photographs by their colours alone."""
     paper = config.preset == "paper"
@@ -167,15 +149,10 @@ def _planes(config: Config, depths: Depths, registered: Registered) -> _Preset:
     return _Preset(scenes.planes(planes), rates, train, sampler, between)
 
 
-def _from_given_poses(config: Config) -> bool:
-    """Whether a PoseNet undoes the disturbance itself, as it is smooth; else it starts registered."""
-    return config.pose == "posenet" and config.noise in ("correlated", "unknown")
-
-
 def _corrected(config: Config, problem: Problem, registered: Registered | None) -> PoseField:
     """The poses to start from, and their correction."""
     t, T_start = problem.train.t, problem.T_start
-    if registered is not None and not _from_given_poses(config):
+    if registered is not None:
         t, T_start = t[registered.supported], registered.T_world_cam[registered.supported]
     start = fields.piecewise_geodesic(jnp.asarray(t, jnp.float32), jnp.asarray(T_start, jnp.float32))
     correct = fields.left_correction if config.side == "world" else fields.right_correction

@@ -38,7 +38,6 @@ from jaxpose.experiments.noisy_nerf.model import (
     build,
     describe,
     found_shutter,
-    initial_state,
     splined,
 )
 from jaxpose.experiments.noisy_nerf.options import (
@@ -115,7 +114,7 @@ def train(
 
     return training_loop.train(
         model,
-        initial_state(config, problem, model, registered),
+        training_loop.initial_state(model, config.seed),
         model.views,
         lambda params: training_loop.mean_errors(poses(params), problem.train.T_world_cam),
         checkpoint,

@@ -1,0 +1,153 @@
+"""Where a feature is to a few hundredths of a pixel: what surrounds it, aligned between photographs.
+
+A blob's centre moves over a round surface as the camera does. The patch that one photograph has there is
+found in each other one by its colours, up to an affine map of the plane, a gain and an offset of each colour
+(Lucas and Kanade 1981; Shi and Tomasi 1994).
+"""
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+_HALF, _SPREAD = 3, 1.5  # of a patch: nodes on each side of its middle, and how fast they count less [px]
+_BLUR = 0.7  # [px] so that interpolated colours have slopes
+_STEPS, _SETTLED = 15, 5e-3  # at most so many, and the move below which there are no more [px]
+_FARTHEST = 1.5  # [px] from where the feature was found: beyond it another one is
+_STRETCH = 0.6  # at least this, and at most one over it, in any direction
+_UNLIKE = 0.5  # of the patch's contrast, that the photographs differ by at most
+_FAINTEST = 1 / 255  # contrast of a patch that is more than rounding
+# The affine map's four numbers, shift, gain and three offsets at the start; squared colours that it takes to
+# move the four by one, and what keeps the others' equations solvable.
+_START = np.array([1.0, 0, 0, 1, 0, 0, 1, 0, 0, 0])
+_STIFF = 1e-4 * np.array([1.0] * 4 + [0.0] * 6)
+_LEAST = 1e-6
+
+
+class Aligned(NamedTuple):
+    """Features where their patches are."""
+
+    pixel: Float[np.ndarray, "o 2"]  # moved where `found`, else as they were
+    found: Bool[np.ndarray, " o"]
+
+
+class _Patches(NamedTuple):
+    """Colours around features, less their mean."""
+
+    mean: Float[np.ndarray, "o 3"]
+    rest: Float[np.ndarray, "o k 3"]
+    contrast: Float[np.ndarray, " o"]
+
+
+def align_patches(
+    rgb: UInt8[np.ndarray, "n h w 3"],
+    view: Int[np.ndarray, " o"],
+    point: Int[np.ndarray, " o"],
+    pixel: Float[np.ndarray, "o 2"],
+    enlarged: int = 1,
+) -> Aligned:
+    """Move every feature of a point to where the patch of one of them is.
+
+    Args:
+        rgb: Photographs (n, h, w, 3).
+        view: Which of them a feature is in (o,).
+        point: Which point it is of (o,).
+        pixel: Where it was found (o, 2) [px].
+        enlarged: How much photographs are enlarged for it.
+
+    Returns:
+        The features, and which of them agree with their point's patch.
+    """
+    place = (pixel + 0.5) * enlarged - 0.5
+    of = _middle(view, point)
+    is_reference = of == np.arange(len(of))
+    images = [_smooth(image, enlarged) for image in rgb]
+    mean, rest = np.zeros((len(view), 3), np.float32), np.zeros((len(view), len(_GRID), 3), np.float32)
+    for index, image in enumerate(images):
+        rows = np.flatnonzero((view == index) & is_reference)
+        patch = _sample(image, place[rows, None] + _GRID)
+        mean[rows] = np.einsum("k,okc->oc", _WEIGHT, patch)
+        rest[rows] = patch - mean[rows, None]
+    contrast = np.sqrt(np.einsum("k,okc->o", _WEIGHT, rest**2) / 3)
+    found, moved = is_reference & (contrast > _FAINTEST), pixel.copy()
+    for index, image in enumerate(images):
+        rows = np.flatnonzero((view == index) & ~is_reference & found[of])
+        if len(rows):
+            patches = _Patches(mean[of[rows]], rest[of[rows]], contrast[of[rows]])
+            shift, good = _aligned(image, place[rows], patches)
+            good &= np.linalg.norm(shift, axis=1) < _FARTHEST * enlarged
+            moved[rows[good]] += shift[good] / enlarged
+            found[rows] = good
+    alone = np.bincount(point[found], minlength=int(point.max(initial=-1)) + 1)[point] < 2
+    return Aligned(moved, found & ~alone)
+
+
+def _middle(view: Int[np.ndarray, " o"], point: Int[np.ndarray, " o"]) -> Int[np.ndarray, " o"]:
+    """The feature, for each, of the same point in the middle of the photographs that see it."""
+    order = np.lexsort((view, point))
+    first = np.searchsorted(point[order], point)
+    count = np.searchsorted(point[order], point, side="right") - first
+    return order[first + count // 2]
+
+
+def _smooth(image: UInt8[np.ndarray, "h w 3"], enlarged: int) -> Float[np.ndarray, "H W 3"]:
+    colours = image.astype(np.float32) / 255
+    if enlarged > 1:
+        colours = cv2.resize(colours, None, fx=enlarged, fy=enlarged, interpolation=cv2.INTER_CUBIC)
+    return cv2.GaussianBlur(colours, (0, 0), _BLUR)
+
+
+def _sample(image: Float[np.ndarray, "H W c"], xy: Float[np.ndarray, "o k 2"]) -> Float[np.ndarray, "o k c"]:
+    """Values between pixels; those of the edge beyond it."""
+    height, width, channels = image.shape
+    x, y = np.clip(xy[..., 0], 0, width - 1.001), np.clip(xy[..., 1], 0, height - 1.001)
+    column, row = x.astype(int), y.astype(int)
+    right, down = ((share.astype(np.float32))[..., None] for share in (x - column, y - row))
+    flat, at = image.reshape(-1, channels), row * width + column
+    above = flat[at] * (1 - right) + flat[at + 1] * right
+    return above * (1 - down) + (flat[at + width] * (1 - right) + flat[at + width + 1] * right) * down
+
+
+def _aligned(
+    image: Float[np.ndarray, "H W 3"],
+    place: Float[np.ndarray, "o 2"],
+    patches: _Patches,
+) -> tuple[Float[np.ndarray, "o 2"], Bool[np.ndarray, " o"]]:
+    """How far patches are from where they are looked for, and whether they are there: Gauss and Newton's."""
+    slopes = [cv2.Sobel(image, cv2.CV_32F, *axis, ksize=3) / 8 for axis in ((1, 0), (0, 1))]
+    seen = np.concatenate([image, *slopes], axis=-1)
+    found = np.tile(_START, (len(place), 1))
+    found[:, 7:] = patches.mean
+    start = found.copy()
+    difference = np.zeros(patches.rest.shape)
+    by_found = np.zeros((*patches.rest.shape, 10), np.float32)
+    x, y = _GRID[:, :1], _GRID[:, 1:]
+    for _ in range(_STEPS):
+        stretch = found[:, :4].reshape(-1, 2, 2)
+        at = place[:, None] + found[:, None, 4:6] + np.einsum("kd,ocd->okc", _GRID, stretch)
+        colour, by_x, by_y = np.split(_sample(seen, at), 3, axis=-1)
+        difference = colour - found[:, 6, None, None] * patches.rest - found[:, None, 7:]
+        parts = (by_x * x, by_x * y, by_y * x, by_y * y, by_x, by_y, -patches.rest)
+        for column, part in enumerate(parts):
+            by_found[..., column] = part
+        by_found[..., (0, 1, 2), (7, 8, 9)] = -1
+        rows = by_found.reshape(len(place), -1, 10)
+        weighted = (rows * np.repeat(_WEIGHT, 3)[:, None]).transpose(0, 2, 1)
+        down = (weighted @ difference.reshape(len(place), -1, 1))[..., 0] + _STIFF * (found - start)
+        step = np.linalg.solve(weighted @ rows + np.diag(_STIFF + _LEAST), down[..., None])[..., 0]
+        found -= step
+        found[:, :4] = np.clip(found[:, :4], _START[:4] - 0.7, _START[:4] + 0.7)
+        found[:, 4:6] = np.clip(found[:, 4:6], -4, 4)
+        if np.abs(step[:, 4:6]).max(initial=0) < _SETTLED:
+            break
+    stretches = np.linalg.svd(found[:, :4].reshape(-1, 2, 2), compute_uv=False)
+    unlike = np.sqrt(np.einsum("k,okc->o", _WEIGHT, difference**2) / 3)
+    alike = unlike < _UNLIKE * patches.contrast
+    return found[:, 4:6], alike & (stretches[:, 1] > _STRETCH) & (stretches[:, 0] < 1 / _STRETCH)
+
+
+_ALONG = np.arange(-_HALF, _HALF + 1, dtype=np.float32)
+_GRID = np.stack(np.meshgrid(_ALONG, _ALONG), axis=-1).reshape(-1, 2)
+_WEIGHT = np.exp(-0.5 * np.sum(_GRID**2, axis=1) / _SPREAD**2)
+_WEIGHT /= _WEIGHT.sum()
