@@ -407,7 +407,9 @@ TARGETS = {
     "registration": Target(
         lambda folder: registration.save(
             folder / "r.npz",
-            registration.Registered(_poses(), np.ones(COUNT, bool), *_BOX, 0.5, 9.0, 7, 0.3, True),
+            registration.Registered(
+                _poses(), np.ones(COUNT, bool), *_BOX, 0.5, 9.0, 7, 0.3, True, np.full((COUNT, 3), 1.25)
+            ),
         ),
         _of("r.npz", lambda file: registration.load(file, COUNT)._replace(far=1.0)),  # may be infinite
     ),

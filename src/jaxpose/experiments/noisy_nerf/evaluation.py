@@ -17,6 +17,7 @@ from jaxpose.experiments.progress import OnUpdate, Update
 from jaxpose.fields import set_progress
 from jaxpose.geometry.rigid import Similarity
 from jaxpose.plots.nerf import HeldOut
+from jaxpose.structure import evenly_exposed, matching_exposure
 from jaxpose.training import photometric
 from jaxpose.training.photometric import Viewer
 from jaxpose.training.steps import State
@@ -30,7 +31,7 @@ PROTOCOL = {
     "centre_error": "distance of camera centres after alignment, mean over training views [scene units]",
     "image_metrics": "psnr, ssim, lpips: mean over the held-out views, their true poses brought into the "
     "estimate's frame by the alignment; test_time_refined: after test-time refinement of each pose on its "
-    "photograph",
+    "photograph; where exposures differ, each render is brought to its photograph's by a gain of each colour",
 }
 
 
@@ -83,7 +84,7 @@ def measure(
     )
     scene = set_progress(state.scene, jnp.ones(()))
     if not np.isfinite(problem.train.T_world_cam).all():
-        return _measure_training_views(problem, viewer, scene, T_world_cam, on_update)
+        return _measure_training_views(problem, viewer, scene, T_world_cam, model.varied, on_update)
     ground_truth = problem.train.T_world_cam
     errors = trajectory_error.pose_errors(T_world_cam, ground_truth)
     at_start = trajectory_error.pose_errors(problem.T_start, ground_truth)
@@ -94,11 +95,11 @@ def measure(
     as_aligned, as_refined, views = [], [], []
     on_update(Update("rendering held-out views", 0, len(keys), "views"))
     for index, (key, pose) in enumerate(zip(keys, T_held_out, strict=True)):
-        image, view = _seen(viewer, scene, problem.held_out, index, pose)
+        image, view = _seen(viewer, scene, problem.held_out, index, pose, model.varied)
         as_aligned.append(image)
         views.append(view)
         if config.test_pose_steps:
-            as_refined.append(_test_time_refined(viewer, scene, problem, index, pose, key))
+            as_refined.append(_test_time_refined(viewer, scene, problem, index, pose, key, model.varied))
         on_update(Update("rendering held-out views", index + 1, len(keys), "views"))
     numbers = {
         **pose_numbers(errors, problem.extent),
@@ -126,12 +127,13 @@ def _measure_training_views(
     viewer: Viewer,
     scene: Any,
     T_world_cam: Float[np.ndarray, "n 4 4"],
+    varied: bool,
     on_update: OnUpdate,
 ) -> Measured:
     """What the scene shows of photographs without known poses, from the poses found for them."""
     rows = np.unique(np.linspace(0, len(T_world_cam) - 1, _TRAINING_VIEWS).round().astype(int))
     on_update(Update("rendering training views"))
-    seen = [_seen(viewer, scene, problem.train, int(row), T_world_cam[row]) for row in rows]
+    seen = [_seen(viewer, scene, problem.train, int(row), T_world_cam[row], varied) for row in rows]
     unknown = dict.fromkeys(POSE_NUMBERS)
     numbers = {
         **unknown,
@@ -152,21 +154,32 @@ def _test_time_refined(
     index: int,
     pose: Float[np.ndarray, "4 4"],
     key: PRNGKeyArray,
+    varied: bool,
 ) -> dict[str, float | None]:
     held_out = problem.held_out
-    rgb = jnp.asarray(held_out.rgb[index])
+    rgb = held_out.rgb[index]
+    if varied:
+        rendered = np.asarray(viewer.image(scene, jnp.asarray(pose, jnp.float32))[0], np.float64)
+        rgb = evenly_exposed(rgb[None], matching_exposure(rendered, rgb)[None])[0][0]
     mask = None if held_out.mask is None else jnp.asarray(held_out.mask[index])
-    moved = viewer.refine_pose(scene, jnp.asarray(pose, jnp.float32), rgb, key, mask)
-    return _seen(viewer, scene, held_out, index, np.asarray(moved, np.float64))[0]
+    moved = viewer.refine_pose(scene, jnp.asarray(pose, jnp.float32), jnp.asarray(rgb), key, mask)
+    return _seen(viewer, scene, held_out, index, np.asarray(moved, np.float64), varied)[0]
 
 
 def _seen(
-    viewer: Viewer, scene: Any, photographs: Photographs, index: int, pose: Float[np.ndarray, "4 4"]
+    viewer: Viewer,
+    scene: Any,
+    photographs: Photographs,
+    index: int,
+    pose: Float[np.ndarray, "4 4"],
+    varied: bool,
 ) -> tuple[dict[str, float | None], HeldOut]:
     """A photograph's view rendered from a pose: how alike they are where pixels count, and both."""
     rgb, depth = viewer.image(scene, jnp.asarray(pose, jnp.float32))
-    rendered = np.clip(np.asarray(rgb, np.float64), 0, 1)
-    photograph = photographs.rgb[index]
+    photograph, rendered = photographs.rgb[index], np.asarray(rgb, np.float64)
+    if varied:
+        rendered = rendered * matching_exposure(rendered, photograph)
+    rendered = np.clip(rendered, 0, 1)
     mask = None if photographs.mask is None else photographs.mask[index]
     label = photographs.files[index]
     return image_metrics(rendered, photograph / 255, mask), HeldOut(

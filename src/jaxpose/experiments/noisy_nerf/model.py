@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, UInt8
 from scipy.interpolate import make_splrep
 
 from jaxpose import fields, scenes
@@ -19,6 +19,7 @@ from jaxpose.experiments.noisy_nerf.registration import Registered
 from jaxpose.experiments.training_loop import CHUNK
 from jaxpose.fields import PoseField, PoseNetConfig
 from jaxpose.scenes import NerfConfig, PlanesConfig, SceneField, nerf, with_occupancy
+from jaxpose.structure import evenly_exposed
 from jaxpose.training.photometric import Depths, Sampler, TrainConfig, Views, importance, trainer
 from jaxpose.training.shutter import Shutter, shutter_of, with_shutter
 from jaxpose.training.steps import Decay, State, Trainer, adam
@@ -73,6 +74,7 @@ class Model(NamedTuple):
     refine_rate: float  # of the test-time pose refinement
     sampler: Sampler | None = None  # where rays are looked at; None: in equal parts
     between: Callable[[State], State] | None = None  # what is done to the state after every chunk of steps
+    varied: bool = False  # whether photographs are exposed differently
 
 
 class _Preset(NamedTuple):
@@ -104,11 +106,8 @@ def build(config: Config, problem: Problem, registered: Registered | None = None
     if config.shutter == "estimate":
         field, pose_rates, shutter = _estimated_shutter(config, photographs, field, pose_rates)
     optimizer = adam({"scene": preset.rates, "pose": pose_rates}, train.steps)
-    views = Views(
-        t,
-        jnp.asarray(photographs.rgb),
-        None if photographs.mask is None else jnp.asarray(photographs.mask),
-    )
+    rgb, mask = _exposed_alike(photographs, registered)
+    views = Views(t, jnp.asarray(rgb), None if mask is None else jnp.asarray(mask))
     of_scene = preset.rates if isinstance(preset.rates, dict) else {"scene": preset.rates}
     return Model(
         preset.scene,
@@ -122,7 +121,18 @@ def build(config: Config, problem: Problem, registered: Registered | None = None
         _BARF_REFINE[barf],
         preset.sampler,
         preset.between,
+        registered is not None and registered.varied,
     )
+
+
+def _exposed_alike(
+    photographs: Photographs, registered: Registered | None
+) -> tuple[UInt8[np.ndarray, "n h w 3"], Bool[np.ndarray, "n h w"] | None]:
+    """The photographs as if all had been exposed alike, and which pixels count."""
+    if registered is None or not registered.varied:
+        return photographs.rgb, photographs.mask
+    rgb, known = evenly_exposed(photographs.rgb, registered.exposure)
+    return rgb, known if photographs.mask is None else known & photographs.mask
 
 
 def _perceptron(config: Config, problem: Problem) -> _Preset:

@@ -12,7 +12,7 @@ from jaxpose.experiments.progress import OnUpdate, Update
 from jaxpose.files import atomic
 from jaxpose.files.schema import FARTHEST_M, numbers, rigid_transforms
 from jaxpose.files.untrusted import read_npz
-from jaxpose.structure import adjust, find_tracks
+from jaxpose.structure import adjust, find_tracks, relative_exposures
 
 # [%] of the points along each axis that the scene's core holds: all but strays, where scenes end; else what
 # is near, as what is far is drawn together.
@@ -20,6 +20,8 @@ _CORE = {"depth": (0.5, 99.5), "disparity": (10.0, 90.0)}
 _MARGIN = 1.3  # times the extent of the points, as surfaces without features go on
 _NEARER, _FARTHER = 0.7, 1.3  # times the depths that 98% of observations have
 _MOST = 0.75  # of the observations; at least 0.87 with calibrated poses, 0.6 to 0.82 where off as by features
+_BRIGHTEST = 1e3  # times brighter than others
+_VARY = 0.05  # spread of exposures; 0.006 to 0.034, of shading, where all photographs are exposed alike
 _WHAT = "the registration of a run"
 
 
@@ -35,6 +37,14 @@ class Registered(NamedTuple):
     points: int
     noise_px: float
     given: bool  # these are the poses of the data, as the photographs agree with them
+    exposure: Float[
+        np.ndarray, "n 3"
+    ]  # how many times brighter than all are on average; 1 where all are alike
+
+    @property
+    def varied(self) -> bool:
+        """Whether photographs are exposed differently."""
+        return bool(np.any(self.exposure != 1))
 
 
 def register(config: Config, problem: Problem, on_update: OnUpdate) -> Registered | None:
@@ -61,6 +71,9 @@ def register(config: Config, problem: Problem, on_update: OnUpdate) -> Registere
     centre, half = (low + high) / 2, np.maximum(_MARGIN * (high - low) / 2, 1e-2 * (far - near))
     is_open = photographs.spacing == "disparity"
     given = config.noise == "none" and bundle.start_agrees > _MOST
+    exposure = relative_exposures(photographs.rgb, photographs.camera, tracks)
+    if np.log(exposure).std() < _VARY:
+        exposure = np.ones_like(exposure)
     return Registered(
         problem.T_start if given else bundle.T_world_cam,
         bundle.supported,
@@ -71,13 +84,14 @@ def register(config: Config, problem: Problem, on_update: OnUpdate) -> Registere
         len(bundle.points),
         bundle.noise_px,
         given,
+        exposure,
     )
 
 
 def summary(problem: Problem, registered: Registered | None) -> dict[str, Any]:
     """The registration in numbers, for `results.json`."""
     if registered is None:
-        nothing = dict.fromkeys(("noise_px", "given_poses_kept", "rotation_error_deg"))
+        nothing = dict.fromkeys(("noise_px", "given_poses_kept", "rotation_error_deg", "exposure_stops"))
         return {"photographs": 0, "points": 0, **nothing}
     truth = problem.train.T_world_cam
     known = np.isfinite(truth).all()
@@ -88,6 +102,7 @@ def summary(problem: Problem, registered: Registered | None) -> dict[str, Any]:
         "noise_px": registered.noise_px,
         "given_poses_kept": registered.given,
         "rotation_error_deg": error,
+        "exposure_stops": float(np.ptp(np.log2(registered.exposure).mean(axis=1))),
     }
 
 
@@ -115,7 +130,10 @@ def load(path: Path, count: int) -> Registered:
     points = int(number("points", whole=True, least=0))
     noise_px = float(number("noise_px", least=0))
     given = bool(number("given", least=0, most=1))
-    return Registered(T, supported > 0, _three(centre), _three(half), near, far, points, noise_px, given)
+    exposure = number("exposure", (count, 3), above=0, most=_BRIGHTEST)
+    return Registered(
+        T, supported > 0, _three(centre), _three(half), near, far, points, noise_px, given, exposure
+    )
 
 
 def _three(values: Float[np.ndarray, "3"]) -> tuple[float, float, float]:

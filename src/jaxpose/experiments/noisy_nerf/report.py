@@ -55,9 +55,12 @@ def _registered(found: dict[str, Any] | None) -> list[str]:
         return []
     error = "" if found["rotation_error_deg"] is None else f": {found['rotation_error_deg']:.2f} deg"
     error = ": the poses of the data agree, and stay" if found["given_poses_kept"] else error
+    stops = found["exposure_stops"]
+    exposed = [f"  exposures    differ by {stops:.2f} stops: photographs are brought to one"] if stops else []
     return [
         f"  features     place {found['photographs']} photographs by {found['points']} points, "
-        f"{found['noise_px']:.2f} px{error}"
+        f"{found['noise_px']:.2f} px{error}",
+        *exposed,
     ]
 
 
