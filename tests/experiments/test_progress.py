@@ -70,6 +70,16 @@ def test_time_left_is_that_of_the_steps_done_here():
     assert line(Update("training", 600, 1000), 10.0, 500) == "  training  600/1000 steps  10 s, 40 s left"
 
 
+def test_time_left_is_not_told_by_a_chunk_that_began_before():
+    """The first 100 steps are told when they are done; waiting for the next chunk makes the rest no longer."""
+    first = Update("training", 100, 1000)
+    assert line(first, 12.0, 100, 12.0) == "  training  100/1000 steps  12 s"
+    second = Update("training", 200, 1000)
+    assert line(second, 10.0, 100) == "  training  200/1000 steps  10 s, 80 s left"
+    assert line(second, 13.0, 100, 3.0) == "  training  200/1000 steps  13 s, 77 s left"
+    assert line(second, 95.0, 100, 85.0) == "  training  200/1000 steps  95 s"
+
+
 @pytest.mark.slow
 def test_a_run_is_never_silent(tmp_path):
     """The run folder first, and then no five seconds without a line."""

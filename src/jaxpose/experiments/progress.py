@@ -79,7 +79,8 @@ class _Screen:
         self.lock = threading.Lock()
         self.update: Update | None = None
         self.began = self.written = time.perf_counter()
-        self.first = 0  # step at which the phase began
+        self.first = 0  # steps done when the phase began, as far as it was told
+        self.reached = self.began  # when the last step was told
         self.open = False  # whether the line may still be redrawn
 
     def show(self, update: Update) -> None:
@@ -87,10 +88,12 @@ class _Screen:
             now = time.perf_counter()
             if self.update is None or update.phase != self.update.phase or update.done < self.update.done:
                 self.end_line()
-                self.began, self.first = now, max(update.done - 1, 0)
+                self.began, self.first, self.reached = now, update.done, now
                 is_new = True
             else:
                 is_new = False
+                if update.done > self.update.done:
+                    self.reached = now
             self.update = update
             if update.quiet:
                 self.written = now
@@ -108,7 +111,8 @@ class _Screen:
 
     def write(self, now: float) -> None:
         assert self.update is not None
-        text, self.written = line(self.update, now - self.began, self.first), now
+        text = line(self.update, now - self.began, self.first, now - self.reached)
+        self.written = now
         if self.redraws:
             width = shutil.get_terminal_size().columns - 1
             self.stream.write(f"\r\x1b[2K{text[:width]}")
@@ -124,13 +128,14 @@ class _Screen:
             self.open = False
 
 
-def line(update: Update, seconds: float, first: int = 0) -> str:
+def line(update: Update, seconds: float, first: int = 0, since: float = 0.0) -> str:
     """An update in words.
 
     Args:
         update: what to say.
         seconds: [s] since the phase began.
-        first: the step it began after, from which the time that is left is estimated.
+        first: the steps that were done then: what others have taken tells what is left.
+        since: [s] for which no step has been told.
 
     Returns:
         One line, without its end.
@@ -142,7 +147,9 @@ def line(update: Update, seconds: float, first: int = 0) -> str:
     if update.total:
         parts.append(f"{update.done}/{update.total} {update.unit}")
     if seconds >= 1:
-        left = seconds * (update.total - update.done) / max(update.done - first, 1)
-        parts.append(f"{seconds:.0f} s" + (f", {left:.0f} s left" if update.total and left >= 1 else ""))
+        left = 0.0
+        if update.done > first:
+            left = (seconds - since) * (update.total - update.done) / (update.done - first) - since
+        parts.append(f"{seconds:.0f} s" + (f", {left:.0f} s left" if left >= 1 else ""))
     parts.extend(f"{name} {value}" for name, value in update.state.items())
     return "  ".join(parts)
