@@ -71,7 +71,7 @@ def test_time_left_is_that_of_the_steps_done_here():
 
 
 def test_time_left_is_not_told_by_a_chunk_that_began_before():
-    """The first 100 steps are told when they are done; waiting for the next chunk makes the rest no longer."""
+    """The first 100 steps are told when they are done; waiting for the next ones makes the rest no longer."""
     first = Update("training", 100, 1000)
     assert line(first, 12.0, 100, 12.0) == "  training  100/1000 steps  12 s"
     second = Update("training", 200, 1000)
