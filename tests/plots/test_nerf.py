@@ -113,6 +113,18 @@ def test_held_out(tmp_path, figures, count):
     assert shown[3].texts[0].get_text() == f"PSNR {-10 * np.log10(mse):.2f} dB"
 
 
+def test_a_sky_leaves_colours_to_what_is_near(tmp_path, figures):
+    """A fifth of the rays end nowhere."""
+    depth = np.full((24, 32), 2.0)
+    depth[:, :16], depth[:5] = 1.0, 1800.0
+    seen = view(np.random.default_rng(0), 1.0)._replace(rendered_depth=depth)
+    nerf_plots.held_out(tmp_path / "held_out.png", [seen], "a title")
+    (figure,) = figures
+    image = [axes for axes in figure.axes if axes.images][2].images[0]
+    low, high = image.get_clim()
+    assert low == 1 and 2 < high < 10
+
+
 def test_a_sheet_without_any_depth(tmp_path, figures):
     nerf_plots.held_out(tmp_path / "held_out.png", [view(np.random.default_rng(0), 0.0)], "a title")
     assert read(tmp_path / "held_out.png").shape[2] == 3

@@ -28,6 +28,8 @@ from jaxpose.plots.style import (
 )
 
 _TICK = 0.13  # length of a drawn frustum, in extents of the true cameras
+_IN_ORDER = {"projection": "3d", "computed_zorder": False}  # what is drawn later is in front
+_FARTHEST = 4.0  # median depths that have colours of their own
 _MOST_FRUSTA = 30
 _PATH_STEP = 0.4  # from view to view, in extents; cameras that jump farther are on no path
 _WORST = 0.3  # colour difference at the end of its scale
@@ -84,7 +86,7 @@ def cameras(
     shown = slice(None, None, -(-len(place) // _MOST_FRUSTA))
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(11, 5.4), dpi=DPI, layout="constrained")
-        panels: list[Any] = list(figure.subplots(1, 2, subplot_kw={"projection": "3d"}))
+        panels: list[Any] = list(figure.subplots(1, 2, subplot_kw=_IN_ORDER))
         for axes, poses, color, name in zip(
             panels, (start, estimate), (LOST, ESTIMATE), ("start", "estimate"), strict=True
         ):
@@ -129,8 +131,9 @@ def held_out(
     views = views[:4]
     depths = np.concatenate([view.rendered_depth.ravel() for view in views])
     depths = depths[(depths > 0) & np.isfinite(depths)]
-    # Few rays see very far: they would take the colours from all others.
-    near, far = np.percentile(depths, (2, 95)) if len(depths) else (0.0, 1.0)
+    # Rays that see very far, as through a scene that never ends, would take the colours from all others.
+    near, middle, far = np.percentile(depths, (2, 50, 95)) if len(depths) else (0.0, 1.0, 1.0)
+    far = min(far, _FARTHEST * middle)
     height, width = views[0].rendered_depth.shape
     with matplotlib.rc_context(STYLE):
         figure = Figure(
