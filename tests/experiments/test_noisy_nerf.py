@@ -309,6 +309,7 @@ def test_stated_poses_stay_where_photographs_agree_with_them(noise_deg, kept):
     rough = problem._replace(T_start=problem.train.T_world_cam @ turned)
     found = registration.register(Config(noise="none"), rough, silent)
     assert found is not None and found.given == kept
+    assert not found.varied  # the orbit is exposed alike
     if kept:
         np.testing.assert_array_equal(found.T_world_cam, rough.T_start)
     else:
@@ -341,25 +342,20 @@ def test_rough_poses_of_files_give_way_and_held_out_views_are_on_the_trajectory(
 
 @pytest.mark.slow
 def test_photographs_exposed_differently_are_brought_to_one_exposure(tmp_path):
-    """Over 1.2 stops, in every colour by itself: found, and no worse a scene; the truth is in no file."""
+    """Over 1.2 stops, in every colour by itself, which no file states."""
     photographs, _ = orbit(40, 64)
     random = np.random.default_rng(0)
     brighter = np.exp(random.uniform(-0.4, 0.4, (40, 1)) + random.uniform(-0.1, 0.1, (40, 3)))
-    config = Config(noise="none", image_width=64, steps=200, rays=256, test_pose_steps=10)
-    results = {}
-    for name, gain in (("alike", np.ones((40, 3))), ("varied", brighter)):
-        seen = np.clip(photographs.rgb * gain[:, None, None], 0, 255).round().astype(np.uint8)
-        for file, rgb in zip(photographs.files, seen, strict=True):
-            (tmp_path / name / file).parent.mkdir(parents=True, exist_ok=True)
-            imageio.imwrite(tmp_path / name / file, rgb)
-        write_transforms(tmp_path / name / "transforms.json", photographs)
-        outcome = noisy_nerf.run(replace(config, data=tmp_path / name, out=tmp_path / f"run_{name}"))
-        results[name] = outcome.results
-        assert ("stops: photographs are brought to one" in report(*outcome)) == (name == "varied")
-    assert results["alike"]["registration"]["exposure_stops"] == 0
-    assert results["varied"]["registration"]["exposure_stops"] == pytest.approx(1.1, abs=0.2)
-    for found in (lambda run: run["psnr"], lambda run: run["test_time_refined"]["psnr"]):
-        assert found(results["varied"]) > found(results["alike"]) - 1.5
+    seen = np.clip(photographs.rgb * brighter[:, None, None], 0, 255).round().astype(np.uint8)
+    for file, rgb in zip(photographs.files, seen, strict=True):
+        (tmp_path / file).parent.mkdir(exist_ok=True)
+        imageio.imwrite(tmp_path / file, rgb)
+    write_transforms(tmp_path / "transforms.json", photographs)
+    config = Config(data=tmp_path, noise="none", image_width=64, steps=200, rays=256, test_pose_steps=10)
+    outcome = noisy_nerf.run(replace(config, out=tmp_path / "run"))
+    assert outcome.results["registration"]["exposure_stops"] == pytest.approx(1.1, abs=0.2)
+    assert "stops: photographs are brought to one" in report(*outcome)
+    assert outcome.results["psnr"] > 18 and outcome.results["test_time_refined"]["psnr"] > 18
 
 
 @pytest.mark.slow
