@@ -35,9 +35,8 @@ except cv2.error as error:
     print(f"  solve: {str(error).splitlines()[0][:60]}")
     assert row, error
 PYTHON
-for version in 4.14.0 5.0.0; do
-  package=$([ $version = 5.0.0 ] && echo 5.0.0.93 || echo 4.14.0.94)
-  "${PYTHON:-python3}" -m venv "$folder/$version"
-  "$folder/$version/bin/pip" install --quiet "opencv-python-headless==$package" "numpy>=2,<3"
-  "$folder/$version/bin/python" "$folder/shapes.py" "$version"
+for package in 4.14.0.94 5.0.0.93; do
+  "${PYTHON:-python3}" -m venv "$folder/$package"
+  "$folder/$package/bin/pip" install --quiet "opencv-python-headless==$package" "numpy>=2,<3"
+  "$folder/$package/bin/python" "$folder/shapes.py" "${package%.*}"
 done

@@ -64,5 +64,7 @@ def test_the_exposure_of_an_image_is_that_of_its_photograph():
     wanted = np.array([0.7, 1.0, 1.6])
     photograph = np.clip(255 * wanted * image, 0, 255).round().astype(np.uint8)
     assert_allclose(matching_exposure(image, photograph), wanted, rtol=0.01)
+    some = image[..., 0] > 0.3
+    assert_allclose(matching_exposure(image[some], photograph[some]), wanted, rtol=0.01)
     assert_array_equal(matching_exposure(np.zeros_like(image), photograph), np.ones(3))
     assert_array_equal(matching_exposure(image, np.full_like(photograph, 255)), np.ones(3))

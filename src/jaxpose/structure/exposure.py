@@ -10,6 +10,7 @@ import scipy.sparse as sp
 from jaxtyping import Bool, Float, UInt8
 
 from jaxpose.geometry.camera import Camera, project_numpy
+from jaxpose.structure.relative import SIGMA_OF_MEDIAN
 from jaxpose.structure.tracks import Tracks
 
 _BLUR = 1.5  # [px] of the colours at a point
@@ -18,7 +19,6 @@ _FEWEST = 12  # points of a photograph whose exposure is believed
 _CUT_OFF = 254  # counts from which a colour may be any brighter one
 _OUTLIER = 2.0  # sigmas
 _ROUNDS = 20
-_MAD = 1.4826  # sigma of a normal distribution by its median distance
 _HELD = 1e-6  # of the usual weight, that holds photographs which nothing is known of
 
 
@@ -70,7 +70,7 @@ def _of_views(
         found -= found.mean()
         places = inverse * np.bincount(point, weight * (logs - found[view]), m)
         left = logs - found[view] - places[point]
-        sigma = max(_MAD * float(np.median(np.abs(left))), 1e-6)
+        sigma = max(SIGMA_OF_MEDIAN * float(np.median(np.abs(left))), 1e-6)
         weight = 1 / (1 + (left / (_OUTLIER * sigma)) ** 2)
     return found
 
@@ -93,13 +93,13 @@ def evenly_exposed(
 
 
 def matching_exposure(
-    image: Float[np.ndarray, "h w 3"], photograph: UInt8[np.ndarray, "h w 3"]
+    image: Float[np.ndarray, "*p 3"], photograph: UInt8[np.ndarray, "*p 3"]
 ) -> Float[np.ndarray, "3"]:
     """How many times brighter a photograph is than an image of the same: least squares over its pixels.
 
     Args:
-        image: Colours (h, w, 3) in [0, 1].
-        photograph: (h, w, 3); pixels that are cut off do not count.
+        image: Colours (..., 3) in [0, 1], all of the image or some of it.
+        photograph: Of the same pixels (..., 3); those that are cut off do not count.
 
     Returns:
         (3,), one for each colour; 1 where nothing tells.

@@ -99,7 +99,7 @@ def _smooth(image: UInt8[np.ndarray, "h w 3"], enlarged: int) -> Float[np.ndarra
 
 
 def _sample(image: Float[np.ndarray, "H W c"], xy: Float[np.ndarray, "o k 2"]) -> Float[np.ndarray, "o k c"]:
-    """Values between pixels; those of the edge beyond it."""
+    """Values between pixels; those of the edge beyond it. OpenCV 4 would round places to 1/32 px."""
     height, width, channels = image.shape
     x, y = np.clip(xy[..., 0], 0, width - 1.001), np.clip(xy[..., 1], 0, height - 1.001)
     column, row = x.astype(int), y.astype(int)

@@ -18,7 +18,7 @@ from jaxpose.structure.tracks import FEWEST, OUTLIER_PX, Tracks
 _STEPS = 10  # of Gauss-Newton
 _FARTHEST = 0.2  # [rad] of a step
 _OUTLIER = 3.0  # sigmas
-_SIGMA_OF_MEDIAN = 1.4826  # of the size of normal errors
+SIGMA_OF_MEDIAN = 1.4826  # of the size of normal errors
 
 
 class RelativeRotations(NamedTuple):
@@ -133,7 +133,7 @@ def _refined(
         by_rotation = np.cross(matches.ray_b, line_b)
         by_direction = np.einsum("oi,oij->oj", np.cross(turned, matches.ray_a), sideways[pair])
         by = np.concatenate([by_rotation, by_direction], axis=1) / slope[:, None]
-        sigma = max(_SIGMA_OF_MEDIAN * float(np.median(np.abs(residual))), 1e-9)
+        sigma = max(SIGMA_OF_MEDIAN * float(np.median(np.abs(residual))), 1e-9)
         weight = 1 / (1 + (residual / (_OUTLIER * sigma)) ** 2) ** 2
         H = total(weight[:, None, None] * by[:, :, None] * by[:, None])
         H += 1e-6 * np.trace(H, axis1=1, axis2=2)[:, None, None] * np.eye(5)

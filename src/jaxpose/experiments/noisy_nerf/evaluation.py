@@ -49,6 +49,22 @@ UNPOSED_PROTOCOL = {
 _TRAINING_VIEWS = 4
 
 
+class _Shown(NamedTuple):
+    """What is looked at: a trained scene, and how."""
+
+    viewer: Viewer
+    scene: Any
+    varied: bool  # whether photographs are exposed differently
+
+
+class _Seen(NamedTuple):
+    """One view of it beside its photograph."""
+
+    numbers: dict[str, float | None]
+    view: HeldOut
+    exposure: Float[np.ndarray, "3"]  # how many times brighter the photograph is than the scene
+
+
 class Measured(NamedTuple):
     """The numbers, views to draw, and poses aligned with the ground truth, where there is any."""
 
@@ -82,9 +98,9 @@ def measure(
         refine_optimizer=optax.adam(model.refine_rate),
         sampler=model.sampler,
     )
-    scene = set_progress(state.scene, jnp.ones(()))
+    shown = _Shown(viewer, set_progress(state.scene, jnp.ones(())), model.varied)
     if not np.isfinite(problem.train.T_world_cam).all():
-        return _measure_training_views(problem, viewer, scene, T_world_cam, model.varied, on_update)
+        return _measure_training_views(problem, shown, T_world_cam, on_update)
     ground_truth = problem.train.T_world_cam
     errors = trajectory_error.pose_errors(T_world_cam, ground_truth)
     at_start = trajectory_error.pose_errors(problem.T_start, ground_truth)
@@ -95,11 +111,11 @@ def measure(
     as_aligned, as_refined, views = [], [], []
     on_update(Update("rendering held-out views", 0, len(keys), "views"))
     for index, (key, pose) in enumerate(zip(keys, T_held_out, strict=True)):
-        image, view = _seen(viewer, scene, problem.held_out, index, pose, model.varied)
-        as_aligned.append(image)
-        views.append(view)
+        seen = _seen(shown, problem.held_out, index, pose)
+        as_aligned.append(seen.numbers)
+        views.append(seen.view)
         if config.test_pose_steps:
-            as_refined.append(_test_time_refined(viewer, scene, problem, index, pose, key, model.varied))
+            as_refined.append(_test_time_refined(shown, problem.held_out, index, pose, seen.exposure, key))
         on_update(Update("rendering held-out views", index + 1, len(keys), "views"))
     numbers = {
         **pose_numbers(errors, problem.extent),
@@ -124,64 +140,52 @@ def measure(
 
 def _measure_training_views(
     problem: Problem,
-    viewer: Viewer,
-    scene: Any,
+    shown: _Shown,
     T_world_cam: Float[np.ndarray, "n 4 4"],
-    varied: bool,
     on_update: OnUpdate,
 ) -> Measured:
     """What the scene shows of photographs without known poses, from the poses found for them."""
     rows = np.unique(np.linspace(0, len(T_world_cam) - 1, _TRAINING_VIEWS).round().astype(int))
     on_update(Update("rendering training views"))
-    seen = [_seen(viewer, scene, problem.train, int(row), T_world_cam[row], varied) for row in rows]
+    seen = [_seen(shown, problem.train, int(row), T_world_cam[row]) for row in rows]
     unknown = dict.fromkeys(POSE_NUMBERS)
     numbers = {
         **unknown,
-        **means([image for image, _ in seen]),
+        **means([each.numbers for each in seen]),
         "test_time_refined": None,
         "start": unknown,
         "max": {"rotation_error_deg": None, "translation_error": None},
         "held_out": [],
     }
     still = Similarity(1.0, np.eye(3), np.zeros(3))
-    return Measured(numbers, [view for _, view in seen], problem.T_start, T_world_cam, still, False)
+    return Measured(numbers, [each.view for each in seen], problem.T_start, T_world_cam, still, False)
 
 
 def _test_time_refined(
-    viewer: Viewer,
-    scene: Any,
-    problem: Problem,
+    shown: _Shown,
+    held_out: Photographs,
     index: int,
     pose: Float[np.ndarray, "4 4"],
+    exposure: Float[np.ndarray, "3"],
     key: PRNGKeyArray,
-    varied: bool,
 ) -> dict[str, float | None]:
-    held_out = problem.held_out
     rgb = held_out.rgb[index]
-    if varied:
-        rendered = np.asarray(viewer.image(scene, jnp.asarray(pose, jnp.float32))[0], np.float64)
-        rgb = evenly_exposed(rgb[None], matching_exposure(rendered, rgb)[None])[0][0]
-    mask = None if held_out.mask is None else jnp.asarray(held_out.mask[index])
-    moved = viewer.refine_pose(scene, jnp.asarray(pose, jnp.float32), jnp.asarray(rgb), key, mask)
-    return _seen(viewer, scene, held_out, index, np.asarray(moved, np.float64), varied)[0]
+    mask = None if held_out.mask is None else held_out.mask[index]
+    if shown.varied:
+        (rgb,), (known,) = evenly_exposed(rgb[None], exposure[None])
+        mask = known if mask is None else known & mask
+    at, counts = jnp.asarray(pose, jnp.float32), None if mask is None else jnp.asarray(mask)
+    moved = shown.viewer.refine_pose(shown.scene, at, jnp.asarray(rgb), key, counts)
+    return _seen(shown, held_out, index, np.asarray(moved, np.float64)).numbers
 
 
-def _seen(
-    viewer: Viewer,
-    scene: Any,
-    photographs: Photographs,
-    index: int,
-    pose: Float[np.ndarray, "4 4"],
-    varied: bool,
-) -> tuple[dict[str, float | None], HeldOut]:
-    """A photograph's view rendered from a pose: how alike they are where pixels count, and both."""
-    rgb, depth = viewer.image(scene, jnp.asarray(pose, jnp.float32))
+def _seen(shown: _Shown, photographs: Photographs, index: int, pose: Float[np.ndarray, "4 4"]) -> _Seen:
+    """A photograph's view rendered from a pose, as bright as the photograph."""
+    rgb, depth = shown.viewer.image(shown.scene, jnp.asarray(pose, jnp.float32))
     photograph, rendered = photographs.rgb[index], np.asarray(rgb, np.float64)
-    if varied:
-        rendered = rendered * matching_exposure(rendered, photograph)
-    rendered = np.clip(rendered, 0, 1)
     mask = None if photographs.mask is None else photographs.mask[index]
-    label = photographs.files[index]
-    return image_metrics(rendered, photograph / 255, mask), HeldOut(
-        label, photograph, rendered, np.asarray(depth, np.float64)
-    )
+    counted = slice(None) if mask is None else mask
+    exposure = matching_exposure(rendered[counted], photograph[counted]) if shown.varied else np.ones(3)
+    rendered = np.clip(rendered * exposure, 0, 1)
+    view = HeldOut(photographs.files[index], photograph, rendered, np.asarray(depth, np.float64))
+    return _Seen(image_metrics(rendered, photograph / 255, mask), view, exposure)

@@ -98,7 +98,6 @@ def train(
     config: Config,
     problem: Problem,
     model: Model,
-    registered: Registered | None,
     checkpoint: Path,
     job: Job,
     on_update: OnUpdate,
@@ -168,7 +167,7 @@ def _single(
         return read_results(finished, "noisy_nerf") if job.writes else devices.followed(job)
     registered = _registered(config, problem, folder, job, on_update)
     model = build(config, problem, registered)
-    trained = train(config, problem, model, registered, checkpoint, job, on_update, label)
+    trained = train(config, problem, model, checkpoint, job, on_update, label)
     devices.leave(job)
     if not job.writes:
         return devices.followed(job)

@@ -37,9 +37,7 @@ class Registered(NamedTuple):
     points: int
     noise_px: float
     given: bool  # these are the poses of the data, as the photographs agree with them
-    exposure: Float[
-        np.ndarray, "n 3"
-    ]  # how many times brighter than all are on average; 1 where all are alike
+    exposure: Float[np.ndarray, "n 3"]  # how many times brighter than the average; 1 where all are alike
 
     @property
     def varied(self) -> bool:
