@@ -94,6 +94,25 @@ def _step(
     T: Float[np.ndarray, "n 4 4"], edges: Edges, weight: Float[np.ndarray, " m"]
 ) -> Float[np.ndarray, "n 6"]:
     """Right increments of all poses by one step of Gauss-Newton; none of the first."""
+    system, gradient = normal_equations(T, edges, weight)
+    step = np.zeros((len(T), 6))
+    step[1:] = -splu(system[6:, 6:]).solve(gradient[6:]).reshape(-1, 6)
+    return step
+
+
+def normal_equations(
+    T: Float[np.ndarray, "n 4 4"], edges: Edges, weight: Float[np.ndarray, " m"]
+) -> tuple[csc_matrix, Float[np.ndarray, " k"]]:
+    """The least squares of relative poses, linear at some poses.
+
+    Args:
+        T: (n, 4, 4) the poses.
+        edges: relative poses between them.
+        weight: (m,) how much each counts.
+
+    Returns:
+        The sparse matrix (6 n, 6 n) over right increments of all poses, and the gradient.
+    """
     residual = _residuals(T, edges)
     by_b = _inverse_right_jacobian(residual)
     by_a = -by_b @ rigid.adjoint(rigid.inverse(T[edges.b]) @ T[edges.a])
@@ -105,12 +124,10 @@ def _step(
     rows = np.broadcast_to(place[:, :, None, :, None], blocks.shape)
     columns = np.broadcast_to(place[:, None, :, None, :], blocks.shape)
     size = 6 * len(T)
-    system = csc_matrix((blocks.ravel(), (rows.ravel(), columns.ravel())), (size, size))[6:, 6:]
+    system = csc_matrix((blocks.ravel(), (rows.ravel(), columns.ravel())), (size, size))
     gradient = np.zeros(size)
     np.add.at(gradient, place, np.einsum("mpik,mk->mpi", weighted, residual))
-    step = np.zeros((len(T), 6))
-    step[1:] = -splu(csc_matrix(system)).solve(gradient[6:]).reshape(-1, 6)
-    return step
+    return system, gradient
 
 
 def _inverse_right_jacobian(xi: Float[np.ndarray, "m 6"]) -> Float[np.ndarray, "m 6 6"]:

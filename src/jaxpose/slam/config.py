@@ -166,9 +166,10 @@ class SlamConfig:
     features: Literal["orb", "none"] = "orb"
     # Places that are seen again correct the trajectory and the map (with features and a fused map).
     loops: bool = True
-    # Frames that are registered once more at the end, to the map of all: those in doubt, between their
-    # neighbours; or all, and the map is made anew (`gauss_newton` and a fused map).
-    refine: Literal["doubted", "all", "none"] = "doubted"
+    # What is done at the end (`gauss_newton` and a fused map): frames in doubt are looked for between their
+    # neighbours (doubted), and keyframes then adjusted together by the points that they share, where colour
+    # and depth belong together (bundle); or all frames are registered to the map of all (all).
+    refine: Literal["bundle", "doubted", "all", "none"] = "bundle"
     # offset, extrinsics: by the final pass over a run with an IMU, beside biases and gravity; line-delay: by
     # three runs before it.
     estimate: tuple[Literal["offset", "extrinsics", "line-delay"], ...] = ()
@@ -231,6 +232,11 @@ class SlamConfig:
     def uses_refinement(self) -> bool:
         """Whether frames are registered again at the end: where a map can be integrated anew."""
         return self.refine != "none" and self.track.method == "gauss_newton" and self.map.method == "fused"
+
+    @property
+    def uses_bundle(self) -> bool:
+        """Whether keyframes are adjusted together at the end, by their features."""
+        return self.refine == "bundle" and self.uses_refinement and self.uses_features
 
     @property
     def uses_field(self) -> bool:

@@ -24,6 +24,7 @@ from jaxpose.slam.beginning import begin, begun_again, told_wrongly
 from jaxpose.slam.config import SlamConfig
 from jaxpose.slam.initial_pose import upright_pose
 from jaxpose.slam.keyframes import FrameReader, coarse_depth, keyframe_images, thumbnail
+from jaxpose.slam.loops.bundle import bundled
 from jaxpose.slam.loops.closure import with_loops
 from jaxpose.slam.loops.rebuild import EACH, resumed, with_room
 from jaxpose.slam.loops.refine import refined
@@ -102,7 +103,7 @@ def step(
 def finish(state: SlamState) -> SlamResult:
     """The whole run so far: its poses, its map with fine colour, one continuous field through all poses.
 
-    No frame is registered again, as `run` does at its end: only the images of keyframes are kept.
+    No frame is looked at again, as `run` does at its end: only the images of keyframes are kept.
 
     Args:
         state: a run of at least two frames, made by `step`; it stays usable.
@@ -125,9 +126,9 @@ def run(
 ) -> SlamResult:
     """Track every frame of an RGB-D recording and map what it sees (Ma et al. 2024, section 3.4).
 
-    At its end frames in doubt are registered once more, to the map of all of them (`config.refine`). Where
-    clock or mounting of the IMU are estimated and were told wrongly, all is tracked again with what was
-    found.
+    At its end frames in doubt are registered once more, to the map of all of them, and keyframes are adjusted
+    together (`config.refine`). Where clock or mounting of the IMU are estimated and were told wrongly, all is
+    tracked again with what was found.
 
     Args:
         recording: frames with times, and what is known beside them. The world's frame is that of its first
@@ -135,7 +136,7 @@ def run(
         config: settings of the run.
         on_frame: called after every frame.
         state: where an earlier run of the same recording stood, to go on from there.
-        on_refined: called at the end with how many frames are registered once more, and how many there are.
+        on_refined: called at the end with how many frames are looked at once more, and how many there are.
 
     Raises:
         DataError: where the recording cannot be tracked: fewer than two frames, no depth in the first, an IMU
@@ -145,6 +146,8 @@ def run(
         state = track_all(recording, config, on_each, state)
         if config.uses_refinement:
             state = refined(state, recording.read, on_refined)
+        if config.uses_bundle and state.earlier is None:  # whose map's poses are not to be changed
+            state = bundled(state, recording.read, on_refined)
     found = _final(state, recording.imu)
     if found.posterior is not None and not state.passes and told_wrongly(state, found.posterior):
         return run(recording, config, on_frame, begun_again(state, found.posterior), on_refined)

@@ -20,6 +20,7 @@ from jaxpose.geometry import rigid
 from jaxpose.geometry.rigid import Similarity
 from jaxpose.structure.global_poses import global_poses
 from jaxpose.structure.relative import sums
+from jaxpose.structure.schur import System, eliminate_points
 from jaxpose.structure.tracks import Tracks
 
 _OUTLIER = 3.0  # sigmas of reprojection
@@ -281,19 +282,9 @@ def _stage(
     return T, points, errors
 
 
-class _System(NamedTuple):
-    """Normal equations in blocks: of the views (increments on the right), of the points, of both."""
-
-    view: Float[np.ndarray, "n 6 6"]
-    point: Float[np.ndarray, "m 3 3"]
-    both: Float[np.ndarray, "o 6 3"]
-    by_view: Float[np.ndarray, "n 6"]
-    by_point: Float[np.ndarray, "m 3"]
-
-
 def _normal_equations(
     problem: _Problem, T: Float[np.ndarray, "n 4 4"], errors: _Errors, width: float
-) -> _System:
+) -> System:
     front = np.isfinite(errors.size)
     ratio = (np.where(front, errors.size, 0) / width) ** 2
     weight = np.where(front, 1 / (1 + ratio) ** 2, 0) / width**2
@@ -309,7 +300,7 @@ def _normal_equations(
     product = lambda a, b: np.einsum("oki,okj->oij", a, b)
     down = lambda a: np.einsum("oki,ok->oi", a, errors.residual)
     total = lambda which, blocks: (which @ blocks.reshape(len(blocks), -1)).reshape(-1, *blocks.shape[1:])
-    return _System(
+    return System(
         total(problem.by_view, product(weighted_view, by_view)),
         total(problem.by_point, product(weighted_point, by_point)),
         product(weighted_view, by_point),
@@ -319,32 +310,12 @@ def _normal_equations(
 
 
 def _solve(
-    problem: _Problem, system: _System, damping: float
+    problem: _Problem, system: System, damping: float
 ) -> tuple[Float[np.ndarray, "n 6"], Float[np.ndarray, "m 3"]]:
     """The increments of poses and points, the points eliminated."""
-    n, m = len(system.view), len(system.point)
-    of_view, of_point = (_damped(blocks, damping) for blocks in (system.view, system.point))
-    inverse = np.linalg.inv(of_point)
-    starts = problem.by_view.indptr  # of each view, in observations
-    sparse = lambda blocks: sp.bsr_matrix((blocks, problem.point, starts), (6 * n, 3 * m))
-    both, eliminated = sparse(system.both), sparse(system.both @ inverse[problem.point])
-    reduced = -(eliminated @ both.T).toarray()
-    place = np.arange(n)
-    reduced.reshape(n, 6, n, 6)[place, :, place, :] += of_view
-    twist = -np.linalg.solve(reduced, system.by_view.ravel() - eliminated @ system.by_point.ravel())
-    shift = -np.einsum("mij,mj->mi", inverse, system.by_point + (both.T @ twist).reshape(m, 3))
-    return twist.reshape(n, 6), shift
-
-
-def _damped(blocks: Float[np.ndarray, "k d d"], damping: float) -> Float[np.ndarray, "k d d"]:
-    """Blocks with more on their diagonals; those of nobody's observations are ones."""
-    d = blocks.shape[-1]
-    diagonal = np.einsum("kii->ki", blocks)
-    least = 1e-9 * diagonal.max()
-    damped = blocks.copy()
-    more = damping * np.maximum(diagonal, 1e-3 * diagonal.max(axis=1, keepdims=True)) + max(least, 1e-30)
-    damped[:, np.arange(d), np.arange(d)] += more
-    return damped
+    reduced = eliminate_points(system, problem.by_view.indptr, problem.point, damping)
+    twist = -np.linalg.solve(reduced.matrix.toarray(), reduced.by_view).reshape(-1, 6)
+    return twist, reduced.shift(twist)
 
 
 def _gauge(

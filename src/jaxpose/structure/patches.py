@@ -5,6 +5,7 @@ found in each other one by its colours, up to an affine map of the plane, a gain
 (Lucas and Kanade 1981; Shi and Tomasi 1994).
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import cv2
@@ -41,7 +42,7 @@ class _Patches(NamedTuple):
 
 
 def align_patches(
-    rgb: UInt8[np.ndarray, "n h w 3"],
+    read: Callable[[int], UInt8[np.ndarray, "h w 3"]],
     view: Int[np.ndarray, " o"],
     point: Int[np.ndarray, " o"],
     pixel: Float[np.ndarray, "o 2"],
@@ -50,7 +51,7 @@ def align_patches(
     """Move every feature of a point to where the patch of one of them is.
 
     Args:
-        rgb: Photographs (n, h, w, 3).
+        read: Gives a photograph (h, w, 3) by its index, each asked for twice, in order.
         view: Which of them a feature is in (o,).
         point: Which point it is of (o,).
         pixel: Where it was found (o, 2) [px].
@@ -62,20 +63,20 @@ def align_patches(
     place = (pixel + 0.5) * enlarged - 0.5
     of = _middle(view, point)
     is_reference = of == np.arange(len(of))
-    images = [_smooth(image, enlarged) for image in rgb]
+    views = range(int(view.max(initial=-1)) + 1)
     mean, rest = np.zeros((len(view), 3), np.float32), np.zeros((len(view), len(_GRID), 3), np.float32)
-    for index, image in enumerate(images):
+    for index in views:
         rows = np.flatnonzero((view == index) & is_reference)
-        patch = _sample(image, place[rows, None] + _GRID)
+        patch = _sample(_smooth(read(index), enlarged), place[rows, None] + _GRID)
         mean[rows] = np.einsum("k,okc->oc", _WEIGHT, patch)
         rest[rows] = patch - mean[rows, None]
     contrast = np.sqrt(np.einsum("k,okc->o", _WEIGHT, rest**2) / 3)
     found, moved = is_reference & (contrast > _FAINTEST), pixel.copy()
-    for index, image in enumerate(images):
+    for index in views:
         rows = np.flatnonzero((view == index) & ~is_reference & found[of])
         if len(rows):
             patches = _Patches(mean[of[rows]], rest[of[rows]], contrast[of[rows]])
-            shift, good = _aligned(image, place[rows], patches)
+            shift, good = _aligned(_smooth(read(index), enlarged), place[rows], patches)
             good &= np.linalg.norm(shift, axis=1) < _FARTHEST * enlarged
             moved[rows[good]] += shift[good] / enlarged
             found[rows] = good
@@ -119,32 +120,43 @@ def _aligned(
     seen = np.concatenate([image, *slopes], axis=-1)
     found = np.tile(_START, (len(place), 1))
     found[:, 7:] = patches.mean
-    start = found.copy()
-    difference = np.zeros(patches.rest.shape)
-    by_found = np.zeros((*patches.rest.shape, 10), np.float32)
-    x, y = _GRID[:, :1], _GRID[:, 1:]
+    start, unlike = found.copy(), np.full(len(place), np.inf)
+    moving = np.arange(len(place))
     for _ in range(_STEPS):
-        stretch = found[:, :4].reshape(-1, 2, 2)
-        at = place[:, None] + found[:, None, 4:6] + np.einsum("kd,ocd->okc", _GRID, stretch)
-        colour, by_x, by_y = np.split(_sample(seen, at), 3, axis=-1)
-        difference = colour - found[:, 6, None, None] * patches.rest - found[:, None, 7:]
-        parts = (by_x * x, by_x * y, by_y * x, by_y * y, by_x, by_y, -patches.rest)
-        for column, part in enumerate(parts):
-            by_found[..., column] = part
-        by_found[..., (0, 1, 2), (7, 8, 9)] = -1
-        rows = by_found.reshape(len(place), -1, 10)
-        weighted = (rows * np.repeat(_WEIGHT, 3)[:, None]).transpose(0, 2, 1)
-        down = (weighted @ difference.reshape(len(place), -1, 1))[..., 0] + _STIFF * (found - start)
-        step = np.linalg.solve(weighted @ rows + np.diag(_STIFF + _LEAST), down[..., None])[..., 0]
-        found -= step
-        found[:, :4] = np.clip(found[:, :4], _START[:4] - 0.7, _START[:4] + 0.7)
-        found[:, 4:6] = np.clip(found[:, 4:6], -4, 4)
-        if np.abs(step[:, 4:6]).max(initial=0) < _SETTLED:
+        step, unlike[moving] = _step(seen, place[moving], patches.rest[moving], found[moving], start[moving])
+        found[moving] -= step
+        found[moving, :4] = np.clip(found[moving, :4], _START[:4] - 0.7, _START[:4] + 0.7)
+        found[moving, 4:6] = np.clip(found[moving, 4:6], -4, 4)
+        moving = moving[np.abs(step[:, 4:6]).max(axis=1) >= _SETTLED]
+        if not len(moving):
             break
     stretches = np.linalg.svd(found[:, :4].reshape(-1, 2, 2), compute_uv=False)
-    unlike = np.sqrt(np.einsum("k,okc->o", _WEIGHT, difference**2) / 3)
     alike = unlike < _UNLIKE * patches.contrast
     return found[:, 4:6], alike & (stretches[:, 1] > _STRETCH) & (stretches[:, 0] < 1 / _STRETCH)
+
+
+def _step(
+    seen: Float[np.ndarray, "H W 9"],
+    place: Float[np.ndarray, "o 2"],
+    rest: Float[np.ndarray, "o k 3"],
+    found: Float[np.ndarray, "o 10"],
+    start: Float[np.ndarray, "o 10"],
+) -> tuple[Float[np.ndarray, "o 10"], Float[np.ndarray, " o"]]:
+    """What to take off `found`, and how unlike patches are there: an image and its slopes are `seen`."""
+    stretch = found[:, :4].reshape(-1, 2, 2)
+    at = place[:, None] + found[:, None, 4:6] + np.einsum("kd,ocd->okc", _GRID, stretch)
+    colour, by_x, by_y = np.split(_sample(seen, at), 3, axis=-1)
+    difference = colour - found[:, 6, None, None] * rest - found[:, None, 7:]
+    by_found = np.zeros((*rest.shape, 10), np.float32)
+    x, y = _GRID[:, :1], _GRID[:, 1:]
+    for column, part in enumerate((by_x * x, by_x * y, by_y * x, by_y * y, by_x, by_y, -rest)):
+        by_found[..., column] = part
+    by_found[..., (0, 1, 2), (7, 8, 9)] = -1
+    rows = by_found.reshape(len(place), -1, 10)
+    weighted = (rows * np.repeat(_WEIGHT, 3)[:, None]).transpose(0, 2, 1)
+    down = (weighted @ difference.reshape(len(place), -1, 1))[..., 0] + _STIFF * (found - start)
+    step = np.linalg.solve(weighted @ rows + np.diag(_STIFF + _LEAST), down[..., None])[..., 0]
+    return step, np.sqrt(np.einsum("k,okc->o", _WEIGHT, difference**2) / 3)
 
 
 _ALONG = np.arange(-_HALF, _HALF + 1, dtype=np.float32)

@@ -81,9 +81,9 @@ def find_tracks(
         both = zip(distance[kept].tolist(), matches[kept].tolist(), strict=True)
         found += [(d, i, a, j, b) for d, (a, b) in both]
         on_step("pairs", done + 1, len(pairs))
-    view, feature, point = _joined(sorted(found), [len(each.pixel) for each in features])
+    view, feature, point = joined(sorted(found), [len(each.pixel) for each in features])
     pixel = np.array([features[v].pixel[f] for v, f in zip(view, feature, strict=True)]).reshape(-1, 2)
-    placed = align_patches(rgb, view, point, pixel, _enlarged(rgb[0]))
+    placed = align_patches(rgb.__getitem__, view, point, pixel, _enlarged(rgb[0]))
     return Tracks(view, point, unproject_numpy(camera, placed.pixel)[:, :2], len(rgb), focal, placed.found)
 
 
@@ -163,12 +163,19 @@ def _verified(
     return kept if len(kept) >= max(FEWEST, _AGREE * len(a)) else none
 
 
-def _joined(
+def joined(
     matches: list[tuple[float, int, int, int, int]], counts: list[int]
 ) -> tuple[Int[np.ndarray, " o"], Int[np.ndarray, " o"], Int[np.ndarray, " o"]]:
-    """View, feature and point of every observation: matches joined, the surest first.
+    """Join matches to points, the surest first.
 
     Two points are not joined that one photograph sees both of: one of the matches between them is wrong.
+
+    Args:
+        matches: Of each its distance, a photograph and which of its features, another one and which of its.
+        counts: How many features each photograph has.
+
+    Returns:
+        View, feature and point of every observation of the points that three photographs see, by views.
     """
     start = np.cumsum([0, *counts]).tolist()
     view = np.repeat(np.arange(len(counts)), counts)

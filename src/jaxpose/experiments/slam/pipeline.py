@@ -145,7 +145,7 @@ def _single(
             on_update(_END)
 
     def on_refined(done: int, total: int) -> None:
-        on_update(_END if done == total else Update("registering to the whole map", done, total, "frames"))
+        on_update(_END if done == total else Update("refining", done, total, "frames"))
 
     result = track(recording, config, on_frame, state, on_refined)
     found, errors = write_run(folder, options, source, result, on_update)

@@ -28,7 +28,7 @@ _RATIO = 0.8  # of the distance to the best match against that to the second bes
 _OUTLIER_PX = 3.0  # of reprojection, in RANSAC
 _OUTLIER = 3.0  # sigmas of reprojection, in the end
 _LEAST_NOISE = 0.3  # [px] of the finest level
-_INDEPENDENT = 50.0  # features: errors of depth and of intrinsics go together
+INDEPENDENT = 50.0  # features: errors of depth and of intrinsics go together
 _STEPS = 10
 _SETTLED = 1e-6  # [m, rad]
 _NEAREST = 1e-3  # [m] in front of the camera
@@ -90,7 +90,7 @@ def locate_camera(
     """
     points, chosen = [], []
     for features, T_world_cam in before:
-        i, j = _matches(features, now)
+        i, j = match(features, now)
         near = features.depth[i] > 0
         points.append(rigid.apply(T_world_cam, features.points_cam[i[near]]))
         chosen.append(j[near])
@@ -129,8 +129,16 @@ def _spread(keypoints: Sequence[Any], shape: tuple[int, ...]) -> Sequence[Any]:
     return [keypoints[k] for k in order[np.argsort(rank, kind="stable")[:_MOST]]]
 
 
-def _matches(a: Features, b: Features) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
-    """Which features of two images look alike, and like no other; each of `b` once."""
+def match(a: Features, b: Features) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
+    """Which features of two images look alike, and like no other; each of `b` once.
+
+    Args:
+        a: features of one image.
+        b: of the other.
+
+    Returns:
+        Rows of `a` and rows of `b`, (m,) each.
+    """
     cv2, none = _opencv(), np.zeros(0, int)
     if len(a.depth) < 2 or len(b.depth) < 2:
         return none, none
@@ -225,5 +233,5 @@ def _refine(
     information = rows.T @ rows
     if inlier.sum() < FEWEST or np.linalg.cond(information) > _SINGULAR:
         return None
-    together = max(float(inlier.sum()) / _INDEPENDENT, 1.0)
+    together = max(float(inlier.sum()) / INDEPENDENT, 1.0)
     return FeaturePose(T, noise**2 * together * np.linalg.inv(information), int(inlier.sum()))

@@ -1,0 +1,51 @@
+"""Keyframes adjusted together at the end: nearer to the truth, but not where colour is beside depth."""
+
+import numpy as np
+import pytest
+
+from jaxpose.datasets.synthetic import RoomConfig, room
+from jaxpose.evaluation import trajectory_error
+from jaxpose.slam import SlamConfig
+from jaxpose.slam.loops.bundle import bundled
+from jaxpose.slam.pipeline import track_all
+
+
+def tracked(recording):
+    return track_all(recording, SlamConfig(map_every_s=0.3))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sensor", ["stereo", "time_of_flight"])
+def test_poses_are_nearer_to_the_truth_and_the_map_is_made_anew(sensor):
+    walk = room(RoomConfig(duration_s=5.0, sensor=sensor, seed=1))
+    state = tracked(walk)
+    before, seen = state.frames, []
+    assert before.keyframe.sum() > 10 and not before.lost.any()
+    poses = lambda frames: frames.T_world_body @ state.T_body_cam
+    error = lambda frames: trajectory_error.ate(poses(frames), walk.T_world_cam).rmse
+    after = bundled(state, walk.read, lambda done, total: seen.append((done, total)))
+    assert error(after.frames) < 0.6 * error(before)
+    assert seen == [(i + 1, len(seen)) for i in range(3 * before.keyframe.sum())]
+    np.testing.assert_allclose(after.frames.T_world_body[0], before.T_world_body[0], atol=1e-9)
+    sigma = lambda frames: np.trace(frames.covariance[frames.keyframe][1:, :3, :3], axis1=1, axis2=2)
+    assert np.median(sigma(after.frames)) < np.median(sigma(before))
+    assert after.map is not None and int(after.map.params.count) > 100 and not len(after.pending)
+
+
+@pytest.mark.slow
+def test_nothing_is_changed_where_colour_is_beside_the_depth():
+    """A colour camera a hand beside the depth camera, whose images nobody has registered."""
+    walk = room(RoomConfig(duration_s=4.0, seed=2))
+
+    def read(i):
+        frame = walk.read(i)
+        near = np.where(frame.depth > 0, 0.1 * walk.camera.fx / np.maximum(frame.depth, 0.3), 0)
+        row, column = np.mgrid[: frame.depth.shape[0], : frame.depth.shape[1]]
+        column = np.clip(np.rint(column + near).astype(int), 0, frame.depth.shape[1] - 1)
+        return frame._replace(rgb=frame.rgb[row, column])
+
+    state = tracked(walk._replace(read=read))
+    assert bundled(state, read) is state
+    few = state.frames.put(np.arange(2, state.frames.count), keyframe=False)
+    few = state._replace(frames=few, keyframe_features=state.keyframe_features[:2])
+    assert bundled(few, walk.read) is few
