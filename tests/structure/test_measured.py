@@ -11,9 +11,9 @@ from jaxpose.geometry import rigid
 from jaxpose.structure.measured import adjust_measured
 
 
-def problem(random, views=12, noise_px=0.3, deep=0.01, moved=0.01, share=0.6):
+def problem(random, views=12, noise_px=0.3, deep=0.01, moved=0.01, share=0.6, count=200):
     """A part of a circle and what it sees, depths with errors as of disparities, motions with errors."""
-    T, points = around(views, degrees=120), random.uniform(-1, 1, (200, 3))
+    T, points = around(views, degrees=120), random.uniform(-1, 1, (count, 3))
     tracks = seen(T, points, random, noise_px=noise_px, share=share)
     z = np.einsum("oj,oj->o", T[tracks.view, :3, 2], points[tracks.point] - T[tracks.view, :3, 3])
     depth = z + deep * z**2 * random.normal(size=len(z))
@@ -54,7 +54,7 @@ def test_no_depth_at_all_leaves_the_motions():
 def test_against_scipy():
     """Errors that are normal: nearly the least squares of the same errors in units of their true spread."""
     random = np.random.default_rng(2)
-    T, tracks, depth, start, motions = problem(random, views=5, share=1.0)
+    T, tracks, depth, start, motions = problem(random, views=5, share=1.0, count=80)
     found = adjust_measured(tracks, depth, start, motions).T_world_cam
 
     def residual(x):

@@ -18,7 +18,7 @@ from jaxpose.slam.batch import own_covariances
 from jaxpose.slam.keyframes import FrameReader, overlap
 from jaxpose.slam.loops.closure import followed
 from jaxpose.slam.loops.rebuild import posed, rebuilt
-from jaxpose.slam.tracking.features import INDEPENDENT, Features, match
+from jaxpose.slam.tracking.features import Features, match
 from jaxpose.slam.types import SlamState
 from jaxpose.structure.measured import Adjusted, adjust_measured
 from jaxpose.structure.patches import align_patches
@@ -29,6 +29,7 @@ _SHARED = 0.3  # of what a keyframe sees, that another one also sees
 _POINTS = 64  # of a keyframe, by which that is found
 _OFF = 0.05  # of the image's width, that matches are off by at tracked poses, at most
 _OUTLIER = 3.0  # times the usual distance of two keyframes' matches at tracked poses
+_INDEPENDENT = 100.0  # observations of a keyframe: errors of depth and of patches go together
 _UNKNOWN = 1.0  # [m, rad] sigma of a motion that is not known
 _GAPS = 1, 2, 4, 8  # keyframes between two whose depth images are compared
 _GRID = 6  # [px] between compared depths
@@ -94,7 +95,7 @@ def _adjusted(
     focal = float(camera.fx + camera.fy) / 2
     tracks = Tracks(view, point, xy, len(T), focal, placed.found)
     found = adjust_measured(tracks, of([each.depth for each in features]), T, _motions(state, keyframes, T))
-    together = max(len(view) / len(T) / INDEPENDENT, 1.0)
+    together = max(len(view) / len(T) / _INDEPENDENT, 1.0)
     return found._replace(motion_covariance=together * found.motion_covariance)
 
 

@@ -28,7 +28,7 @@ _RATIO = 0.8  # of the distance to the best match against that to the second bes
 _OUTLIER_PX = 3.0  # of reprojection, in RANSAC
 _OUTLIER = 3.0  # sigmas of reprojection, in the end
 _LEAST_NOISE = 0.3  # [px] of the finest level
-INDEPENDENT = 50.0  # features: errors of depth and of intrinsics go together
+_INDEPENDENT = 50.0  # features: errors of depth and of intrinsics go together
 _STEPS = 10
 _SETTLED = 1e-6  # [m, rad]
 _NEAREST = 1e-3  # [m] in front of the camera
@@ -233,5 +233,5 @@ def _refine(
     information = rows.T @ rows
     if inlier.sum() < FEWEST or np.linalg.cond(information) > _SINGULAR:
         return None
-    together = max(float(inlier.sum()) / INDEPENDENT, 1.0)
+    together = max(float(inlier.sum()) / _INDEPENDENT, 1.0)
     return FeaturePose(T, noise**2 * together * np.linalg.inv(information), int(inlier.sum()))
