@@ -92,7 +92,7 @@ def adjust_measured(
 
 def _factor(chi2: Float[np.ndarray, " m"], tied: csc_matrix, solver: SuperLU, generator: np.random.Generator):
     """What the motions' information is to be multiplied by, so that they disagree as much as it says."""
-    probe = generator.choice([-1.0, 1.0], (tied.shape[0], _PROBES))  # Hutchinson 1989
+    probe = generator.choice([-1.0, 1.0], (6 * len(chi2), _PROBES))  # Hutchinson 1989
     taken = float(np.mean(np.sum(probe * (tied @ solver.solve(probe)), axis=0)))
     left = max(6 * len(chi2) - taken, 1.0)
     return left / max(float(np.minimum(chi2, _LARGE * np.median(chi2)).sum()), 1e-9)

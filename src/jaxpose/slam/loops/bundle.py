@@ -7,10 +7,12 @@ poses found than at those tracked, colour is beside the depth or of another time
 """
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxpose.datasets.types import Frame
 from jaxpose.estimate.pose_graph import Edges
 from jaxpose.geometry import rigid
 from jaxpose.geometry.camera import Camera, project_numpy, unproject_numpy
@@ -37,6 +39,20 @@ _SAME = 0.1  # of the depth, beyond which two are of different surfaces
 _WORSE = 1.1  # times as far apart: what depth says, and features against it
 
 
+class Proposal(NamedTuple):
+    """What features, depths and motions together make of the keyframes, and what depth images say to it."""
+
+    keyframes: Int[np.ndarray, " k"]  # which frames
+    T_world_cam: Float[np.ndarray, "k 4 4"]
+    motion_covariance: Float[np.ndarray, "j 6 6"]  # from each to the next, right increments of the later one
+    apart: float  # how many times as far apart depth images are as at the poses before, in the mean
+
+    @property
+    def agrees(self) -> bool:
+        """Whether depth does not contradict it."""
+        return self.apart < _WORSE
+
+
 def bundled(
     state: SlamState, read: FrameReader, on_keyframe: Callable[[int, int], None] | None = None
 ) -> SlamState:
@@ -50,13 +66,35 @@ def bundled(
     Returns:
         The state, as it was where too little is shared, and where depth contradicts what is found.
     """
+    found = propose(state, read, on_keyframe)
+    if found is None or not found.agrees:
+        return state
+    T = state.frames.T_world_body[found.keyframes] @ state.T_body_cam
+    frames = followed(state.frames, found.keyframes, found.T_world_cam @ rigid.inverse(T))
+    frames = frames.put(found.keyframes[1:], covariance=found.motion_covariance)
+    return rebuilt(state._replace(frames=frames), np.flatnonzero(frames.mapped), read)
+
+
+def propose(
+    state: SlamState, read: FrameReader, on_keyframe: Callable[[int, int], None] | None = None
+) -> Proposal | None:
+    """Where features, depths and motions together have the keyframes.
+
+    Args:
+        state: a run.
+        read: its frames.
+        on_keyframe: called with how many images are looked at, and how many are to be.
+
+    Returns:
+        Their poses; None where too little is shared.
+    """
     keyframes = np.flatnonzero(state.frames.keyframe)
     if len(keyframes) < 3 or len(state.keyframe_features) < len(keyframes):
-        return state
+        return None
     T = state.frames.T_world_body[keyframes] @ state.T_body_cam
     looked = iter(range(1, 3 * len(keyframes) + 1))
 
-    def image(k: int):
+    def image(k: int) -> Frame:
         if on_keyframe is not None:
             on_keyframe(next(looked), 3 * len(keyframes))
         i = int(keyframes[k])
@@ -64,13 +102,9 @@ def bundled(
 
     found = _adjusted(state, keyframes, T, lambda k: image(k).rgb)
     if found is None:
-        return state
+        return None
     apart = _depths_apart(lambda k: image(k).depth, (T, found.T_world_cam), state.camera)
-    if not apart < np.log(_WORSE):
-        return state
-    frames = followed(state.frames, keyframes, found.T_world_cam @ rigid.inverse(T))
-    frames = frames.put(keyframes[1:], covariance=found.motion_covariance)
-    return rebuilt(state._replace(frames=frames), np.flatnonzero(frames.mapped), read)
+    return Proposal(keyframes, found.T_world_cam, found.motion_covariance, apart)
 
 
 def _adjusted(
@@ -149,7 +183,7 @@ def _motions(state: SlamState, keyframes: Int[np.ndarray, " k"], T: Float[np.nda
 def _depths_apart(
     depth: Callable[[int], np.ndarray], poses: tuple[Float[np.ndarray, "k 4 4"], ...], camera: Camera
 ) -> float:
-    """Logarithm of how much farther apart depth images are at the second poses than at the first."""
+    """How many times as far apart depth images are at the second poses as at the first."""
     height, width = camera.height, camera.width
     row, column = (x.ravel() for x in np.mgrid[0:height:_GRID, 0:width:_GRID])
     ray = unproject_numpy(camera, np.stack([column, row], axis=-1).astype(np.float64))
@@ -164,7 +198,7 @@ def _depths_apart(
             both = np.isfinite(before) & np.isfinite(after)
             if both.sum() >= _POINTS:
                 ratios.append(np.log(np.median(after[both]) / max(np.median(before[both]), 1e-9)))
-    return float(np.mean(ratios)) if ratios else np.inf
+    return float(np.exp(np.mean(ratios))) if ratios else np.inf
 
 
 def _apart(
