@@ -2,7 +2,7 @@
 
 A recording is tracked once. Printed are the ATE of keyframes as tracked and as all that they share would have
 them, how many times as far apart depth images are there, and whether that is taken; then the ATE of all
-frames and how long it took, the map made anew.
+frames, and how long making the map anew took.
 """
 
 import time
@@ -14,7 +14,7 @@ from jaxpose.evaluation import trajectory_error
 from jaxpose.experiments.imu_slam import Config
 from jaxpose.experiments.slam.options import slam_config
 from jaxpose.experiments.slam.source import load
-from jaxpose.slam.loops.bundle import bundled, propose
+from jaxpose.slam.loops.bundle import adopt, propose
 from jaxpose.slam.pipeline import track_all
 
 
@@ -32,10 +32,14 @@ def main() -> None:
         return
     before, after = (ate(T, truth[k]) for T in (poses(state)[k], found.T_world_cam))
     taken = "taken" if found.agrees else "left"
-    print(f"  keyframes {before:.3f} -> {after:.3f} cm, depths {found.apart:.2f} times as far apart: {taken}")
+    apart = f"depths {found.depths_apart:.2f} times as far apart"
+    print(f"  keyframes {before:.3f} -> {after:.3f} cm, {apart}: {taken}")
+    if not found.agrees:
+        return
     started = time.perf_counter()
-    of_all_now = ate(poses(bundled(state, recording.read)), truth)
-    print(f"  all frames {of_all:.3f} -> {of_all_now:.3f} cm, in {time.perf_counter() - started:.1f} s")
+    now = ate(poses(adopt(state, found, recording.read)), truth)
+    seconds = time.perf_counter() - started
+    print(f"  all frames {of_all:.3f} -> {now:.3f} cm, the map anew in {seconds:.1f} s")
 
 
 def poses(state):

@@ -6,7 +6,7 @@ import pytest
 from jaxpose.datasets.synthetic import RoomConfig, room
 from jaxpose.evaluation import trajectory_error
 from jaxpose.slam import SlamConfig
-from jaxpose.slam.loops.bundle import bundled
+from jaxpose.slam.loops.bundle import adopt, propose
 from jaxpose.slam.pipeline import track_all
 
 
@@ -23,7 +23,11 @@ def test_poses_are_nearer_to_the_truth_and_the_map_is_made_anew(sensor):
     assert before.keyframe.sum() > 10 and not before.lost.any()
     poses = lambda frames: frames.T_world_body @ state.T_body_cam
     error = lambda frames: trajectory_error.ate(poses(frames), walk.T_world_cam).rmse
-    after = bundled(state, walk.read, lambda done, total: seen.append((done, total)))
+    found = propose(state, walk.read, lambda done, total: seen.append((done, total)))
+    assert found is not None and found.agrees and 0.9 < found.depths_apart < 1.05
+    after = adopt(state, found, walk.read)
+    moved = np.linalg.norm((poses(after.frames) - poses(before))[before.keyframe][:, :3, 3], axis=1)
+    assert moved.max() == pytest.approx(found.moved_max, rel=1e-6)
     assert error(after.frames) < 0.6 * error(before)
     assert seen == [(i + 1, len(seen)) for i in range(3 * before.keyframe.sum())]
     np.testing.assert_allclose(after.frames.T_world_body[0], before.T_world_body[0], atol=1e-9)
@@ -45,7 +49,8 @@ def test_nothing_is_changed_where_colour_is_beside_the_depth():
         return frame._replace(rgb=frame.rgb[row, column])
 
     state = tracked(walk._replace(read=read))
-    assert bundled(state, read) is state
+    found = propose(state, read)
+    assert found is not None and not found.agrees and found.depths_apart > 1.3
     few = state.frames.put(np.arange(2, state.frames.count), keyframe=False)
     few = state._replace(frames=few, keyframe_features=state.keyframe_features[:2])
-    assert bundled(few, walk.read) is few
+    assert propose(few, read) is None

@@ -24,10 +24,11 @@ from jaxpose.slam.beginning import begin, begun_again, told_wrongly
 from jaxpose.slam.config import SlamConfig
 from jaxpose.slam.initial_pose import upright_pose
 from jaxpose.slam.keyframes import FrameReader, coarse_depth, keyframe_images, thumbnail
-from jaxpose.slam.loops.bundle import bundled
+from jaxpose.slam.loops.bundle import adopt, propose
 from jaxpose.slam.loops.closure import with_loops
 from jaxpose.slam.loops.rebuild import EACH, resumed, with_room
 from jaxpose.slam.loops.refine import refined
+from jaxpose.slam.loops.types import Proposal
 from jaxpose.slam.map.backend import (
     as_blocks,
     framed_field,
@@ -142,16 +143,19 @@ def run(
         DataError: where the recording cannot be tracked: fewer than two frames, no depth in the first, an IMU
             asked for and not there.
     """
+    bundle = None
     with end_compiled(recording, config, on_frame) as on_each:
         state = track_all(recording, config, on_each, state)
         if config.uses_refinement:
             state = refined(state, recording.read, on_refined)
         if config.uses_bundle and state.earlier is None:  # whose map's poses are not to be changed
-            state = bundled(state, recording.read, on_refined)
+            bundle = propose(state, recording.read, on_refined)
+            if bundle is not None and bundle.agrees:
+                state = adopt(state, bundle, recording.read)
     found = _final(state, recording.imu)
     if found.posterior is not None and not state.passes and told_wrongly(state, found.posterior):
         return run(recording, config, on_frame, begun_again(state, found.posterior), on_refined)
-    return _summed_up(state, recording.read, found)
+    return _summed_up(state, recording.read, found, bundle)
 
 
 def track_all(
@@ -266,7 +270,9 @@ def _final(state: SlamState, imu: Imu | None) -> FinalTrajectory:
     return final_trajectory(state, imu)
 
 
-def _summed_up(state: SlamState, read: FrameReader, found: FinalTrajectory) -> SlamResult:
+def _summed_up(
+    state: SlamState, read: FrameReader, found: FinalTrajectory, bundle: Proposal | None = None
+) -> SlamResult:
     """The run with its trajectory, and with the texture of its map."""
     if state.config.frame == "intrinsic" and not is_due(state.frames.count - 1):
         state = _update_intrinsic_frame(state)
@@ -281,6 +287,7 @@ def _summed_up(state: SlamState, read: FrameReader, found: FinalTrajectory) -> S
         T_world_cam_odometry=frames.T_odometry @ state.T_body_cam,
         frames=frames,
         loops=state.loops,
+        bundle=bundle,
         coarser_at=state.coarser_at,
         keyframe_features=state.keyframe_features,
         T_body_cam=state.T_body_cam,

@@ -16,7 +16,7 @@ from jaxpose.imu import Imu
 from jaxpose.scenes import GridConfig, SceneField
 from jaxpose.scenes.voxel_blocks import BlockConfig, Blocks
 from jaxpose.slam.config import SlamConfig
-from jaxpose.slam.loops.types import Loops
+from jaxpose.slam.loops.types import Loops, Proposal
 from jaxpose.slam.map.photometric import MapState
 from jaxpose.slam.map.texture import Texture
 from jaxpose.slam.tracking.features import Features
@@ -202,6 +202,7 @@ class SlamResult(NamedTuple):
     T_world_cam_odometry: Float[np.ndarray, "n 4 4"]  # motions as tracked, put together without loops
     frames: Frames
     loops: Loops
+    bundle: Proposal | None  # of the keyframes at the end; taken if it agrees
     coarser_at: Int[np.ndarray, " c"]  # frames at which voxels became twice as wide (`config.map_budget_gb`)
     keyframe_features: tuple[Features, ...]  # by which a later run finds where it is
     T_body_cam: Float[np.ndarray, "4 4"]  # the camera on the IMU, as tracking had it

@@ -64,18 +64,21 @@ def align_patches(
     of = _middle(view, point)
     is_reference = of == np.arange(len(of))
     views = range(int(view.max(initial=-1)) + 1)
-    mean, rest = np.zeros((len(view), 3), np.float32), np.zeros((len(view), len(_GRID), 3), np.float32)
+    slot = np.cumsum(is_reference) - 1  # patches of references alone are kept
+    count = int(is_reference.sum())
+    mean, rest = np.zeros((count, 3), np.float32), np.zeros((count, len(_GRID), 3), np.float32)
     for index in views:
         rows = np.flatnonzero((view == index) & is_reference)
         patch = _sample(_smooth(read(index), enlarged), place[rows, None] + _GRID)
-        mean[rows] = np.einsum("k,okc->oc", _WEIGHT, patch)
-        rest[rows] = patch - mean[rows, None]
+        mean[slot[rows]] = np.einsum("k,okc->oc", _WEIGHT, patch)
+        rest[slot[rows]] = patch - mean[slot[rows], None]
     contrast = np.sqrt(np.einsum("k,okc->o", _WEIGHT, rest**2) / 3)
-    found, moved = is_reference & (contrast > _FAINTEST), pixel.copy()
+    found, moved = is_reference.copy(), pixel.copy()
+    found[is_reference] = contrast > _FAINTEST
     for index in views:
         rows = np.flatnonzero((view == index) & ~is_reference & found[of])
         if len(rows):
-            patches = _Patches(mean[of[rows]], rest[of[rows]], contrast[of[rows]])
+            patches = _Patches(*(each[slot[of[rows]]] for each in (mean, rest, contrast)))
             shift, good = _aligned(_smooth(read(index), enlarged), place[rows], patches)
             good &= np.linalg.norm(shift, axis=1) < _FARTHEST * enlarged
             moved[rows[good]] += shift[good] / enlarged

@@ -96,6 +96,7 @@ def tracking_numbers(result: SlamResult) -> dict[str, Any]:
         "depth_error_median_m": trajectory_error.statistics(result.frames.depth_error).median,
         "keyframes": result.keyframes,
         "loops": loop_numbers(result),
+        "bundle": bundle_numbers(result),
         "field_rmse_m": result.field_rmse_m,
         "field_rmse_deg": result.field_rmse_deg,
     }
@@ -111,6 +112,15 @@ def loop_numbers(result: SlamResult) -> dict[str, Any]:
         "frames": np.stack([result.loops.a, result.loops.b], axis=1)[believed],
         "moved_max_m": float(np.linalg.norm(moved, axis=1).max()) if believed.any() else 0.0,
     }
+
+
+def bundle_numbers(result: SlamResult) -> dict[str, Any] | None:
+    """What adjusting keyframes together found, and whether it was taken; None where it was not tried."""
+    found = result.bundle
+    if found is None:
+        return None
+    numbers = {"moved_max_m": found.moved_max, "depths_apart": found.depths_apart, "taken": found.agrees}
+    return {"keyframes": len(found.keyframes), **numbers}
 
 
 def freedom(recording: Recording, result: SlamResult) -> Freedom | None:

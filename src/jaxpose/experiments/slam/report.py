@@ -72,6 +72,7 @@ def report(folder: Path, results: dict[str, Any]) -> str:
             f"{results['frames_uncertain']} uncertain",
         ),
         *_loops(results),
+        *_bundle(results),
         _line(
             "time per frame",
             f"{results['seconds_per_frame']:.3f} s  median after the first two, which compile; "
@@ -134,6 +135,20 @@ def _against_ground_truth(results: dict[str, Any]) -> list[str]:
             "from one frame to the next",
         ))  # fmt: skip
     return lines
+
+
+def _bundle(results: dict[str, Any]) -> list[str]:
+    """Whether keyframes were adjusted together at the end."""
+    bundle = results["bundle"]
+    if bundle is None:
+        return []
+    if bundle["taken"]:
+        moved = f"by up to {_cm(bundle['moved_max_m'])} cm"
+        return [
+            _line("bundle", f"{bundle['keyframes']} keyframes adjusted together, which moved them {moved}")
+        ]
+    worse = f"{bundle['depths_apart']:.2f} times as far apart"
+    return [_line("bundle", f"not taken: depth images are {worse} where features have the keyframes")]
 
 
 def _loops(results: dict[str, Any]) -> list[str]:

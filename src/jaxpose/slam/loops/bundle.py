@@ -3,11 +3,11 @@
 A frame is registered to what was mapped before it, so that errors add up along the way. Here points that
 many keyframes see hold all of them at once, each point moved to where its patch is to a fraction of a pixel.
 That takes a camera whose colour and depth belong together. Where depth images fit each other less well at the
-poses found than at those tracked, colour is beside the depth or of another time, and nothing is changed.
+poses found than at those tracked, colour is beside the depth or of another time, and what is found is not
+to be taken.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -20,12 +20,14 @@ from jaxpose.slam.batch import own_covariances
 from jaxpose.slam.keyframes import FrameReader, overlap
 from jaxpose.slam.loops.closure import followed
 from jaxpose.slam.loops.rebuild import posed, rebuilt
+from jaxpose.slam.loops.types import Proposal
 from jaxpose.slam.tracking.features import Features, match
 from jaxpose.slam.types import SlamState
 from jaxpose.structure.measured import Adjusted, adjust_measured
 from jaxpose.structure.patches import align_patches
 from jaxpose.structure.tracks import FEWEST, Tracks, joined
 
+_MOST = 500  # keyframes: half a megabyte is held of each
 _NEXT, _FAR = 4, 6  # keyframes after each, and others that see the same, that it is matched with
 _SHARED = 0.3  # of what a keyframe sees, that another one also sees
 _POINTS = 64  # of a keyframe, by which that is found
@@ -39,42 +41,6 @@ _SAME = 0.1  # of the depth, beyond which two are of different surfaces
 _WORSE = 1.1  # times as far apart: what depth says, and features against it
 
 
-class Proposal(NamedTuple):
-    """What features, depths and motions together make of the keyframes, and what depth images say to it."""
-
-    keyframes: Int[np.ndarray, " k"]  # which frames
-    T_world_cam: Float[np.ndarray, "k 4 4"]
-    motion_covariance: Float[np.ndarray, "j 6 6"]  # from each to the next, right increments of the later one
-    apart: float  # how many times as far apart depth images are as at the poses before, in the mean
-
-    @property
-    def agrees(self) -> bool:
-        """Whether depth does not contradict it."""
-        return self.apart < _WORSE
-
-
-def bundled(
-    state: SlamState, read: FrameReader, on_keyframe: Callable[[int, int], None] | None = None
-) -> SlamState:
-    """The run with keyframes where features, depths and motions together have them; others follow.
-
-    Args:
-        state: a run that maps by integration. Its map is no longer usable, if poses are changed.
-        read: its frames.
-        on_keyframe: called with how many images are looked at, and how many are to be.
-
-    Returns:
-        The state, as it was where too little is shared, and where depth contradicts what is found.
-    """
-    found = propose(state, read, on_keyframe)
-    if found is None or not found.agrees:
-        return state
-    T = state.frames.T_world_body[found.keyframes] @ state.T_body_cam
-    frames = followed(state.frames, found.keyframes, found.T_world_cam @ rigid.inverse(T))
-    frames = frames.put(found.keyframes[1:], covariance=found.motion_covariance)
-    return rebuilt(state._replace(frames=frames), np.flatnonzero(frames.mapped), read)
-
-
 def propose(
     state: SlamState, read: FrameReader, on_keyframe: Callable[[int, int], None] | None = None
 ) -> Proposal | None:
@@ -86,10 +52,11 @@ def propose(
         on_keyframe: called with how many images are looked at, and how many are to be.
 
     Returns:
-        Their poses; None where too little is shared.
+        Their poses, to be taken where depth agrees; None where too little is shared, and of more than
+        500 keyframes.
     """
     keyframes = np.flatnonzero(state.frames.keyframe)
-    if len(keyframes) < 3 or len(state.keyframe_features) < len(keyframes):
+    if not 3 <= len(keyframes) <= _MOST or len(state.keyframe_features) < len(keyframes):
         return None
     T = state.frames.T_world_body[keyframes] @ state.T_body_cam
     looked = iter(range(1, 3 * len(keyframes) + 1))
@@ -104,7 +71,25 @@ def propose(
     if found is None:
         return None
     apart = _depths_apart(lambda k: image(k).depth, (T, found.T_world_cam), state.camera)
-    return Proposal(keyframes, found.T_world_cam, found.motion_covariance, apart)
+    moved = float(np.linalg.norm(found.T_world_cam[:, :3, 3] - T[:, :3, 3], axis=1).max())
+    return Proposal(keyframes, found.T_world_cam, found.motion_covariance, moved, apart, apart < _WORSE)
+
+
+def adopt(state: SlamState, found: Proposal, read: FrameReader) -> SlamState:
+    """The run with keyframes where they are proposed, other frames moved with them, and the map made anew.
+
+    Args:
+        state: a run that maps by integration. Its map is no longer usable.
+        found: what is proposed for it.
+        read: its frames.
+
+    Returns:
+        The state.
+    """
+    T = state.frames.T_world_body[found.keyframes] @ state.T_body_cam
+    frames = followed(state.frames, found.keyframes, found.T_world_cam @ rigid.inverse(T))
+    frames = frames.put(found.keyframes[1:], covariance=found.motion_covariance)
+    return rebuilt(state._replace(frames=frames), np.flatnonzero(frames.mapped), read)
 
 
 def _adjusted(

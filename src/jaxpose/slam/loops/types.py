@@ -32,3 +32,14 @@ def no_loops(count: int = 0) -> Loops:
         np.zeros((count, 6, 6)),
         np.zeros(count, bool),
     )
+
+
+class Proposal(NamedTuple):
+    """Where features, depths and motions together have the keyframes, and what depth images say to it."""
+
+    keyframes: Int[np.ndarray, " k"]  # which frames
+    T_world_cam: Float[np.ndarray, "k 4 4"]
+    motion_covariance: Float[np.ndarray, "j 6 6"]  # from each to the next, right increments of the later one
+    moved_max: float  # [m] of a keyframe
+    depths_apart: float  # how many times as far apart depth images are as where they were tracked
+    agrees: bool  # whether that is no contradiction: then it is to be taken
