@@ -50,7 +50,9 @@ def test_nothing_is_changed_where_colour_is_beside_the_depth():
 
     state = tracked(walk._replace(read=read))
     found = propose(state, read)
-    assert found is not None and not found.agrees and found.depths_apart > 1.3
+    assert found is not None and not found.agrees
+    T, truth = (x[found.keyframes] for x in (state.frames.T_world_body @ state.T_body_cam, walk.T_world_cam))
+    assert trajectory_error.ate(found.T_world_cam, truth).rmse > 2 * trajectory_error.ate(T, truth).rmse
     few = state.frames.put(np.arange(2, state.frames.count), keyframe=False)
     few = state._replace(frames=few, keyframe_features=state.keyframe_features[:2])
     assert propose(few, read) is None

@@ -8,7 +8,7 @@ from helpers.wall import CAMERA, rays, wall
 from numpy.testing import assert_allclose, assert_array_equal
 
 from jaxpose.geometry.camera import Camera
-from jaxpose.slam.map.integrate import seen_by, tangent_planes
+from jaxpose.slam.map.integrate import seen_by, tangent_planes, without_stipple
 from jaxpose.slam.observation import Image, depth_sigma, locate
 
 ACROSS = np.array([0.0, 0, -1])
@@ -102,3 +102,33 @@ def test_what_pixels_say_of_points():
     assert_allclose(rgb, 0.2, rtol=1e-6)
     nowhere = np.float32([[5.0, 0, 1], [0, 0, -1], [0.42, 0, 1]])
     assert_array_equal(look(np.tile(nowhere, (17, 1))[:50])[3], 0)
+
+
+def stippled(depth):
+    """What a coarser camera's points leave of an image, a fifth of it."""
+    row, column = np.mgrid[: depth.shape[0], : depth.shape[1]]
+    return np.where((5 * row // 3 % 5 % 2 == 0) & (column % 5 % 2 == 0), depth, 0).astype(np.float32)
+
+
+def test_between_the_points_of_a_stipple_depth_is_that_of_the_surface():
+    depth, _ = wall((0.3, -0.2, -1), 1.4)
+    sparse = stippled(depth)
+    assert 0.15 < np.mean(sparse > 0) < 0.4
+    found = np.asarray(without_stipple(jnp.asarray(sparse)))[2:-2, 2:-2]
+    inner = depth[2:-2, 2:-2]
+    assert np.mean(found > 0) > 0.85
+    assert_allclose(found[found > 0], inner[found > 0], rtol=1e-4)
+
+
+def test_nothing_is_put_between_two_surfaces_nor_into_a_dense_image():
+    near, _ = wall((0, 0, -1), 1.0)
+    far, _ = wall((0, 0, -1), 2.0)
+    half = near.shape[1] // 2
+    both = np.concatenate([near[:, :half], far[:, half:]], axis=1)
+    found = np.asarray(without_stipple(jnp.asarray(stippled(both))))
+    assert np.mean(found > 0) > 0.8
+    on_one = np.isclose(found, near, rtol=1e-3) | np.isclose(found, far, rtol=1e-3) | (found == 0)
+    assert on_one.all()
+    holes = np.where(np.random.default_rng(0).random(near.shape) < 0.2, 0, near).astype(np.float32)
+    assert_array_equal(without_stipple(jnp.asarray(holes)), holes)
+    assert not np.any(without_stipple(jnp.zeros((8, 8))))

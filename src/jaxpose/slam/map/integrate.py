@@ -43,6 +43,8 @@ _NEAREST = 3**0.5  # voxels: nodes of the cells that hold a surface
 _CUT = 0.98  # of a distance's reach: what is nearer to its end was cut off
 _RADIUS = 4  # [px] of the window that slopes are measured in
 _SAME_SURFACE = 3.0  # sigmas of depth that the middle between two pixels may be off the pixel there
+_GAP = 3  # [px] from an empty pixel to measured ones on both sides, at most
+_STIPPLED = 1.5  # times as many pixels with depth: an image that has so many more by what lies between is one
 GRAZING = 0.1  # cosine of incidence below which a plane says nothing
 
 
@@ -190,10 +192,11 @@ def in_view_test(camera: Camera) -> Callable[[Float[Array, "m 8 3"], Float[Array
 
 def seen_by(image: Image, camera: Camera) -> Callable[[Located], SurfaceObservation]:
     """What an image says at located points, ready to be asked: one row is read for each."""
-    planes = tangent_planes(image.depth, camera)
+    depth = without_stipple(image.depth)
+    planes = tangent_planes(depth, camera)
     cosine = _cosine(planes[..., :3], jnp.asarray(_rays(camera)))
-    near = (depth_sigma(jnp.ones(())) / depth_sigma(image.depth)) ** 2
-    weight = jnp.where(image.depth > 0, near * jnp.maximum(cosine, GRAZING), 0)
+    near = (depth_sigma(jnp.ones(())) / depth_sigma(depth)) ** 2
+    weight = jnp.where(depth > 0, near * jnp.maximum(cosine, GRAZING), 0)
     rgb = image.rgb.astype(planes.dtype) / 255 * image.exposure[None, None]
     rows = jnp.concatenate([planes, weight[..., None], rgb], axis=-1)
 
@@ -204,6 +207,36 @@ def seen_by(image: Image, camera: Camera) -> Callable[[Located], SurfaceObservat
         )
 
     return at
+
+
+def without_stipple(depth: Float[Array, "h w"]) -> Float[Array, "h w"]:
+    """Depth [m] also between pixels that measured it, where most pixels did not.
+
+    A coarser camera's points, carried over to the pixels of colour, leave a regular pattern of empty ones,
+    and nodes of a map that see one would learn nothing. Inverse depth is linear between two pixels on both
+    sides that are of one surface. An image that gains less than half its depth by it stays as it is.
+    """
+    inverse = jnp.where(depth > 0, 1 / jnp.where(depth > 0, depth, 1), 0)
+    total, count = jnp.zeros_like(depth), jnp.zeros_like(depth)
+    for row, column in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        (after, far), (before, near) = (_first_seen(inverse, way * row, way * column) for way in (1, -1))
+        least = jnp.maximum(jnp.maximum(after, before), 1e-3)
+        same = (after > 0) & (before > 0)
+        same &= jnp.abs(after - before) < 2 * _SAME_SURFACE * depth_sigma(1 / least) * least**2
+        line = (near * after + far * before) / jnp.maximum(near + far, 1)
+        total, count = total + jnp.where(same, line, 0), count + jnp.where(same, 1.0, 0)
+    between = jnp.where(total > 0, count / jnp.where(total > 0, total, 1), 0)
+    filled = jnp.where(depth > 0, depth, between)
+    return jnp.where(jnp.mean(filled > 0) > _STIPPLED * jnp.mean(depth > 0), filled, depth)
+
+
+def _first_seen(inverse: Float[Array, "h w"], row: int, column: int):
+    """The first value that is not 0 in a direction, up to _GAP steps on, and after how many; 0: none."""
+    found, steps = jnp.zeros_like(inverse), jnp.zeros_like(inverse)
+    for k in range(_GAP, 0, -1):
+        there = _shifted(_shifted(inverse, k * row, 0), k * column, 1)
+        found, steps = jnp.where(there > 0, there, found), jnp.where(there > 0, float(k), steps)
+    return found, steps
 
 
 def tangent_planes(depth: Float[Array, "h w"], camera: Camera) -> Float[Array, "h w 4"]:
