@@ -139,7 +139,7 @@ def _against_ground_truth(results: dict[str, Any]) -> list[str]:
 
 def _bundle(results: dict[str, Any]) -> list[str]:
     """Whether keyframes were adjusted together at the end."""
-    bundle = results["bundle"]
+    bundle = results.get("bundle")  # runs made before it was tried have none
     if bundle is None:
         return []
     if bundle["taken"]:
