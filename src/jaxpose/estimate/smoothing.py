@@ -289,7 +289,7 @@ def _drift_steps(
     to_camera = np.linalg.inv(to_world[after])
     if drift is None:
         return np.tile(np.eye(6) / _NO_DRIFT, (len(after), 1, 1)), to_camera
-    added = np.cumsum((to_world @ drift @ np.swapaxes(to_world, 1, 2))[1:], axis=0)
+    added = np.cumsum(rigid.carried(T_world_cam, drift)[1:], axis=0)
     added = np.concatenate([np.zeros((1, 6, 6)), added]).reshape(len(t), 36)
     total = np.stack([np.interp(ends, t, column) for column in added.T], axis=1).reshape(-1, 6, 6)
     covariance = to_camera @ np.diff(total, axis=0) @ np.swapaxes(to_camera, 1, 2) + _NO_DRIFT**2 * np.eye(6)

@@ -248,6 +248,22 @@ def adjoint(T_a_b: Float[np.ndarray, "*n 4 4"]) -> Float[np.ndarray, "*n 6 6"]:
     return result
 
 
+def carried(
+    T_a_b: Float[np.ndarray, "*n 4 4"], covariance_b: Float[np.ndarray, "*n 6 6"]
+) -> Float[np.ndarray, "*n 6 6"]:
+    """The covariance of twists of frame b, seen from a.
+
+    Args:
+        T_a_b: Transforms (..., 4, 4).
+        covariance_b: Of twists [translation, rotation] (..., 6, 6).
+
+    Returns:
+        Covariances (..., 6, 6).
+    """
+    to_a = adjoint(T_a_b)
+    return to_a @ covariance_b @ np.swapaxes(to_a, -1, -2)
+
+
 def _hat(v: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
     """The matrix of the cross product with v from the left."""
     return np.cross(np.eye(3), v[..., None, :])

@@ -152,8 +152,7 @@ def tracked_covariances(
     Returns:
         Covariances of poses, and of moves of one second.
     """
-    to_world = rigid.adjoint(T_world_cam)
-    added = np.cumsum((to_world @ own @ np.swapaxes(to_world, 1, 2))[1:], axis=0)
+    added = np.cumsum(rigid.carried(T_world_cam, own)[1:], axis=0)
     added = np.concatenate([np.zeros((1, 6, 6)), added])
     step, dt = rigid.log(rigid.inverse(T_world_cam[:-1]) @ T_world_cam[1:]), np.diff(t)
     change = (step[1:] / dt[1:, None] - step[:-1] / dt[:-1, None]) / ((dt[1:] + dt[:-1]) / 2)[:, None]
@@ -169,13 +168,9 @@ def tracked_covariances(
         bridged = density * (dt[i, None] ** 3 * (u * (1 - u)) ** 2 / 6)
         return T, between(added), between(own) + bridged[:, :, None] * np.eye(6)
 
-    def carried(T, covariance):
-        by = rigid.adjoint(T)
-        return by @ covariance @ np.swapaxes(by, 1, 2)
-
     times, early = table_times((float(t[0]), float(t[-1])))
     T, shared, alone = at(times)
     (T_a, shared_a, alone_a), (T_b, shared_b, alone_b) = at(early), at(early + 1.0)
     T_b_world = rigid.inverse(T_b)
-    moved = carried(T_b_world, shared_b - shared_a) + alone_b + carried(T_b_world @ T_a, alone_a)
-    return Covariances(times, carried(rigid.inverse(T), shared) + alone, moved)
+    by_first = rigid.carried(T_b_world, shared_b - shared_a) + rigid.carried(T_b_world @ T_a, alone_a)
+    return Covariances(times, rigid.carried(rigid.inverse(T), shared) + alone, by_first + alone_b)

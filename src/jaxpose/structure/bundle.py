@@ -19,8 +19,8 @@ from jaxpose.evaluation.trajectory_error import align, procrustes
 from jaxpose.geometry import rigid
 from jaxpose.geometry.rigid import Similarity
 from jaxpose.structure.global_poses import global_poses
-from jaxpose.structure.relative import sums
-from jaxpose.structure.schur import System, eliminate_points
+from jaxpose.structure.relative import MEDIAN_LENGTH, sums
+from jaxpose.structure.schur import System, eliminate_points, normal_equations
 from jaxpose.structure.tracks import Tracks
 
 _OUTLIER = 3.0  # sigmas of reprojection
@@ -31,7 +31,6 @@ _LEAST_NOISE = 0.05  # [px]
 _WIDE = 90  # [%] of the errors at the start, that the loss begins with
 _WEIGHINGS, _WEIGHED = 5, 0.05  # at most so many, and the share by which weights have to change
 _STEPS, _SETTLED = 15, 1e-3  # of a stage: at most so many, and the share by which its loss has to fall
-_MEDIAN_LENGTH = 1.177  # of a vector in the plane, normal in both directions, in sigmas
 _NEAREST = 1e-2  # of the usual depth, in front of a camera
 _WIDEST = 1e-2  # spread of camera centres, in usual depths, below which they are all in one place
 
@@ -142,7 +141,7 @@ def _solution(
         T, points, errors = _stage(problem, T, points, sigma)
         median = float(np.median(errors.size))
         on_step(sigma, median)
-        narrower = max(sigma / _NARROWER, median / _MEDIAN_LENGTH, _LEAST_NOISE)
+        narrower = max(sigma / _NARROWER, median / MEDIAN_LENGTH, _LEAST_NOISE)
         if narrower > 0.9 * sigma:
             return _Solution(T, points, errors, sigma)
         sigma = narrower
@@ -288,25 +287,15 @@ def _normal_equations(
     front = np.isfinite(errors.size)
     ratio = (np.where(front, errors.size, 0) / width) ** 2
     weight = np.where(front, 1 / (1 + ratio) ** 2, 0) / width**2
-    x, y, z = np.where(front[:, None], errors.point_cam, 1.0).T
+    point_cam = np.where(front[:, None], errors.point_cam, 1.0)
+    x, y, z = point_cam.T
     zero = np.zeros_like(z)
     by_cam = (problem.focal * problem.weight)[:, None, None] * np.stack(
         [np.stack([1 / z, zero, -x / z**2], -1), np.stack([zero, 1 / z, -y / z**2], -1)], 1
     )  # of the residual by the point in camera axes
-    by_point = np.einsum("oij,okj->oik", by_cam, T[problem.view, :3, :3])
-    turned = np.cross(by_cam, np.where(front[:, None], errors.point_cam, 1.0)[:, None])
-    by_view = np.concatenate([-by_cam, turned], axis=-1)
-    weighted_view, weighted_point = (weight[:, None, None] * each for each in (by_view, by_point))
-    product = lambda a, b: np.einsum("oki,okj->oij", a, b)
-    down = lambda a: np.einsum("oki,ok->oi", a, errors.residual)
-    total = lambda which, blocks: (which @ blocks.reshape(len(blocks), -1)).reshape(-1, *blocks.shape[1:])
-    return System(
-        total(problem.by_view, product(weighted_view, by_view)),
-        total(problem.by_point, product(weighted_point, by_point)),
-        product(weighted_view, by_point),
-        total(problem.by_view, down(weighted_view)),
-        total(problem.by_point, down(weighted_point)),
-    )
+    R, both = T[problem.view, :3, :3], np.repeat(weight[:, None], 2, axis=1)
+    sums_over = problem.by_view, problem.by_point
+    return normal_equations(by_cam, point_cam, R, errors.residual, both, sums_over)
 
 
 def _solve(

@@ -12,13 +12,12 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components, mini
 
 from jaxpose.estimate.pose_graph import Edges, optimise_pose_graph
 from jaxpose.geometry import rigid
-from jaxpose.structure.relative import RelativeRotations, relative_rotations, sums
+from jaxpose.structure.relative import MEDIAN_LENGTH, RelativeRotations, relative_rotations, sums
 from jaxpose.structure.tracks import Tracks
 
 _MEDIAN_CHI2 = 2.366  # of three degrees of freedom
 _ROUNDS = 6  # of reweighting
 _OUTLIER = 3.0  # sigmas
-_SIGMA_OF_MEDIAN = 1.177  # of a vector in the plane, normal in both directions
 _NEAREST = 0.1  # of the usual distance, below which an error does not count for more
 
 
@@ -108,7 +107,7 @@ def _places(tracks: Tracks, R: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, 
         distance = np.maximum(np.abs(along), _NEAREST * usual)
         angle = np.linalg.norm(np.einsum("oij,oj->oi", across, away), axis=1) / distance
         angle[along < 0] = np.inf
-        sigma = max(float(np.median(angle)) / _SIGMA_OF_MEDIAN, 1e-6)
+        sigma = max(float(np.median(angle)) / MEDIAN_LENGTH, 1e-6)
         weight = (usual / distance) ** 2 / (1 + (angle / (_OUTLIER * sigma)) ** 2) ** 2
     return centre / usual
 

@@ -11,18 +11,18 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.sparse import csc_matrix
+from scipy.sparse import csc_matrix, csr_matrix
 from scipy.sparse.linalg import SuperLU, splu
 
 from jaxpose._checks import check_finite, check_shapes
 from jaxpose.estimate.pose_graph import Edges, normal_equations, squared_distances
 from jaxpose.geometry import rigid
-from jaxpose.structure.relative import SIGMA_OF_MEDIAN, sums
+from jaxpose.structure import schur
+from jaxpose.structure.relative import MEDIAN_LENGTH, SIGMA_OF_MEDIAN, sums
 from jaxpose.structure.schur import System, eliminate_points
 from jaxpose.structure.tracks import Tracks
 
 _OUTLIER = 3.0  # sigmas
-_MEDIAN_LENGTH = 1.177  # of a vector in the plane, normal in both directions, in sigmas
 _LEAST_PX, _LEAST_DEPTH = 0.05, 1e-4  # [px, 1/m] of a spread
 _STEPS, _SETTLED = 25, 2e-5  # at most so many, and the step [m, rad] below which there are no more
 _FIRST = 2  # steps by motions as they are stated
@@ -40,6 +40,8 @@ class _Observations(NamedTuple):
     xy: Float[np.ndarray, "o 2"]
     depth: Float[np.ndarray, " o"]  # [m]; 0 where there is none
     kind: Int[np.ndarray, " o"]  # 1: aligned
+    by_view: csr_matrix  # (n, o), sums over the observations of each view
+    by_point: csr_matrix  # (m, o)
 
 
 class Adjusted(NamedTuple):
@@ -71,12 +73,11 @@ def adjust_measured(
     seen, generator = _measured(tracks, depth), np.random.default_rng(0)
     if not len(seen.view):
         return Adjusted(np.array(T_start, np.float64), np.linalg.inv(motions.information))
-    starts = np.searchsorted(seen.view, np.arange(tracks.views + 1))
     T, points = np.array(T_start, np.float64), _start_points(seen, T_start)
     weight = np.ones(len(motions.a))
     for index in range(_STEPS):
         system = _normal_equations(seen, T, points, tracks.focal)
-        reduced = eliminate_points(system, starts, seen.point, _DAMPING)
+        reduced = eliminate_points(system, seen.by_view.indptr, seen.point, _DAMPING)
         tied, down = normal_equations(T, motions, weight)
         solver = splu(csc_matrix(reduced.matrix + tied)[6:, 6:])
         twist = np.zeros((len(T), 6))
@@ -104,18 +105,13 @@ def _motion_covariances(T: Float[np.ndarray, "n 4 4"], solver: SuperLU) -> Float
     to_later = -rigid.adjoint(rigid.inverse(T[1:]) @ T[:-1])
     found = np.zeros((len(T) - 1, 6, 6))
     before = np.zeros((6, 6))
-    for k in range(len(T) - 1):
+    for k, by_before in enumerate(to_later):
         unit = np.zeros((size, 6))
         unit[6 * k : 6 * k + 6] = np.eye(6)
-        column = solver.solve(unit)
-        own = column[6 * k : 6 * k + 6]
-        if k == 0:
-            found[0] = own
-        else:
-            across = column[6 * k - 6 : 6 * k]  # of the pose before and this one
-            found[k] = (
-                to_later[k] @ before @ to_later[k].T + own + to_later[k] @ across + across.T @ to_later[k].T
-            )
+        column = np.concatenate([np.zeros((6, 6)), solver.solve(unit)])  # of the first pose: zeros
+        across, own = column[6 * k : 6 * k + 6], column[6 * k + 6 : 6 * k + 12]
+        both = by_before @ across
+        found[k] = by_before @ before @ by_before.T + own + both + both.T
         before = own
     return found
 
@@ -125,8 +121,9 @@ def _measured(tracks: Tracks, depth: Float[np.ndarray, " o"]) -> _Observations:
     kept = np.flatnonzero(known[tracks.point])
     kept = kept[np.argsort(tracks.view[kept], kind="stable")]
     _, point = np.unique(tracks.point[kept], return_inverse=True)
-    kind = tracks.aligned[kept].astype(int)
-    return _Observations(tracks.view[kept], point, tracks.xy_cam[kept], depth[kept], kind)
+    view, kind = tracks.view[kept], tracks.aligned[kept].astype(int)
+    of_view, of_point = sums(view, tracks.views), sums(point, int(point.max(initial=-1)) + 1)
+    return _Observations(view, point, tracks.xy_cam[kept], depth[kept], kind, of_view, of_point)
 
 
 def _start_points(seen: _Observations, T: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "m 3"]:
@@ -152,22 +149,9 @@ def _normal_equations(
     by_cam[:, 0, 0] = by_cam[:, 1, 1] = focal / z
     by_cam[:, :2, 2] = -focal * point_cam[:, :2] / z[:, None] ** 2
     by_cam[:, 2, 2] = 1 / z**2
-    by_view = np.concatenate([-by_cam, np.cross(by_cam, point_cam[:, None])], axis=-1)
-    by_point = np.einsum("oij,okj->oik", by_cam, R)
     weight = _weights(seen, np.linalg.norm(off, axis=1), deep)
     weight *= (point_cam[:, 2] > _NEAREST)[:, None]
-    weighted_view, weighted_point = weight[..., None] * by_view, weight[..., None] * by_point
-    product = lambda a, b: np.einsum("oki,okj->oij", a, b)
-    down = lambda a: np.einsum("oki,ok->oi", a, residual)
-    of_view, of_point = sums(seen.view, len(T)), sums(seen.point, len(points))
-    total = lambda which, blocks: (which @ blocks.reshape(len(blocks), -1)).reshape(-1, *blocks.shape[1:])
-    return System(
-        total(of_view, product(weighted_view, by_view)),
-        total(of_point, product(weighted_point, by_point)),
-        product(weighted_view, by_point),
-        total(of_view, down(weighted_view)),
-        total(of_point, down(weighted_point)),
-    )
+    return schur.normal_equations(by_cam, point_cam, R, residual, weight, (seen.by_view, seen.by_point))
 
 
 def _weights(
@@ -178,7 +162,7 @@ def _weights(
     for kind in (0, 1):
         of_kind = size[seen.kind == kind]
         if len(of_kind):
-            sigma[kind] = max(float(np.median(of_kind)) / _MEDIAN_LENGTH, _LEAST_PX)
+            sigma[kind] = max(float(np.median(of_kind)) / MEDIAN_LENGTH, _LEAST_PX)
     measured = seen.depth > 0
     spread = max(SIGMA_OF_MEDIAN * float(np.median(np.abs(deep[measured]))), _LEAST_DEPTH)
     robust = lambda error, sigma: 1 / (1 + (error / (_OUTLIER * sigma)) ** 2) ** 2 / sigma**2

@@ -51,7 +51,7 @@ def align_patches(
     """Move every feature of a point to where the patch of one of them is.
 
     Args:
-        read: Gives a photograph (h, w, 3) by its index, each asked for twice, in order.
+        read: Gives a photograph (h, w, 3) by its index, each asked for up to twice, in order.
         view: Which of them a feature is in (o,).
         point: Which point it is of (o,).
         pixel: Where it was found (o, 2) [px].

@@ -19,6 +19,7 @@ _STEPS = 10  # of Gauss-Newton
 _FARTHEST = 0.2  # [rad] of a step
 _OUTLIER = 3.0  # sigmas
 SIGMA_OF_MEDIAN = 1.4826  # of the size of normal errors
+MEDIAN_LENGTH = 1.177  # of a vector in the plane, normal in both directions, in sigmas
 
 
 class RelativeRotations(NamedTuple):

@@ -32,6 +32,43 @@ class Reduced(NamedTuple):
         return -np.einsum("mij,mj->mi", self.inverse, down)
 
 
+def normal_equations(
+    by_cam: Float[np.ndarray, "o d 3"],
+    point_cam: Float[np.ndarray, "o 3"],
+    R_world_cam: Float[np.ndarray, "o 3 3"],
+    residual: Float[np.ndarray, "o d"],
+    weight: Float[np.ndarray, "o d"],
+    sums: tuple[sp.csr_matrix, sp.csr_matrix],
+) -> System:
+    """The least squares of residuals of points as views see them, linear at some poses and points.
+
+    Args:
+        by_cam: Derivative of each residual by its point in camera axes.
+        point_cam: The point there.
+        R_world_cam: Rotation of its view.
+        residual: Residuals.
+        weight: What each counts.
+        sums: Over the observations of each view, and of each point.
+
+    Returns:
+        The equations.
+    """
+    by_view = np.concatenate([-by_cam, np.cross(by_cam, point_cam[:, None])], axis=-1)
+    by_point = np.einsum("oij,okj->oik", by_cam, R_world_cam)
+    weighted_view, weighted_point = (weight[..., None] * each for each in (by_view, by_point))
+    product = lambda a, b: np.einsum("oki,okj->oij", a, b)
+    down = lambda a: np.einsum("oki,ok->oi", a, residual)
+    total = lambda which, blocks: (which @ blocks.reshape(len(blocks), -1)).reshape(-1, *blocks.shape[1:])
+    of_view, of_point = sums
+    return System(
+        total(of_view, product(weighted_view, by_view)),
+        total(of_point, product(weighted_point, by_point)),
+        product(weighted_view, by_point),
+        total(of_view, down(weighted_view)),
+        total(of_point, down(weighted_point)),
+    )
+
+
 def eliminate_points(
     system: System, starts: Int[np.ndarray, " s"], point: Int[np.ndarray, " o"], damping: float
 ) -> Reduced:

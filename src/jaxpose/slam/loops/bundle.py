@@ -103,7 +103,8 @@ def _adjusted(
     pixel = [project_numpy(camera, each.direction_cam) for each in features]
     matches = []
     for a, b in _pairs(features, T, camera):
-        i, j, off = _agreeing(features[a], features[b], rigid.inverse(T[b]) @ T[a], camera)
+        T_b_a = rigid.inverse(T[b]) @ T[a]
+        i, j, off = _agreeing((features[a], features[b]), (pixel[a], pixel[b]), T_b_a, camera)
         matches += [(e, a, p, b, q) for e, p, q in zip(off.tolist(), i.tolist(), j.tolist(), strict=True)]
     view, feature, point = joined(sorted(matches), [len(each.depth) for each in features])
     if not len(view):
@@ -137,16 +138,21 @@ def _pairs(features: tuple[Features, ...], T: Float[np.ndarray, "k 4 4"], camera
 
 
 def _agreeing(
-    a: Features, b: Features, T_b_a: Float[np.ndarray, "4 4"], camera: Camera
-) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+    features: tuple[Features, Features],
+    pixels: tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "m 2"]],
+    T_b_a: Float[np.ndarray, "4 4"],
+    camera: Camera,
+) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"], Float[np.ndarray, " k"]]:
     """Matches of two keyframes that are about where poses as tracked have them, and how far off [px]."""
+    (a, b), (pixel_a, pixel_b) = features, pixels
     i, j = match(a, b)
     off = np.full(len(i), np.inf)
-    for one, p, other, q, T in ((a, i, b, j, T_b_a), (b, j, a, i, rigid.inverse(T_b_a))):
-        there = rigid.apply(T, one.points_cam[p])
-        known = (one.depth[p] > 0) & (there[:, 2] > 0)
-        seen, expected = (project_numpy(camera, x) for x in (other.direction_cam[q[known]], there[known]))
-        off[known] = np.minimum(off[known], np.linalg.norm(expected - seen, axis=1))
+    ways = (a, i, T_b_a, pixel_b[j]), (b, j, rigid.inverse(T_b_a), pixel_a[i])
+    for one, row, T, seen in ways:
+        there = rigid.apply(T, one.points_cam[row])
+        known = (one.depth[row] > 0) & (there[:, 2] > 0)
+        apart = np.linalg.norm(project_numpy(camera, there[known]) - seen[known], axis=1)
+        off[known] = np.minimum(off[known], apart)
     usual = float(np.median(off[np.isfinite(off)])) if np.isfinite(off).any() else np.inf
     good = off < _OUTLIER * max(usual, 1.0)
     if usual > _OFF * camera.width or good.sum() < FEWEST:
@@ -159,8 +165,7 @@ def _motions(state: SlamState, keyframes: Int[np.ndarray, " k"], T: Float[np.nda
     own = own_covariances(state.frames)[keyframes]
     own[np.isnan(own).any(axis=(1, 2))] = _UNKNOWN**2 * np.eye(6)
     motion = rigid.inverse(T[:-1]) @ T[1:]
-    carry = rigid.adjoint(rigid.inverse(motion))
-    covariance = carry @ own[:-1] @ np.swapaxes(carry, 1, 2) + own[1:]
+    covariance = rigid.carried(rigid.inverse(motion), own[:-1]) + own[1:]
     a = np.arange(len(motion))
     return Edges(a, a + 1, motion, np.linalg.inv(covariance), np.zeros(len(a), bool))
 
