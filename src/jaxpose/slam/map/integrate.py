@@ -214,9 +214,14 @@ def without_stipple(depth: Float[Array, "h w"]) -> Float[Array, "h w"]:
 
     A coarser camera's points, carried over to the pixels of colour, leave a regular pattern of empty ones,
     and nodes of a map that see one would learn nothing. Inverse depth is linear between two pixels on both
-    sides that are of one surface. An image that gains less than half its depth by it stays as it is.
+    sides that are of one surface. An image that gains less than half its depth by it stays as it is; one
+    that has no room for so much is not looked at.
     """
-    inverse = jnp.where(depth > 0, 1 / jnp.where(depth > 0, depth, 1), 0)
+    return jax.lax.cond(jnp.mean(depth > 0) * _STIPPLED < 1, _filled, lambda depth: depth, depth)
+
+
+def _filled(depth: Float[Array, "h w"]) -> Float[Array, "h w"]:
+    inverse = _inverse(depth)
     total, count = jnp.zeros_like(depth), jnp.zeros_like(depth)
     for row, column in ((0, 1), (1, 0), (1, 1), (1, -1)):
         (after, far), (before, near) = (_first_seen(inverse, way * row, way * column) for way in (1, -1))
@@ -228,6 +233,11 @@ def without_stipple(depth: Float[Array, "h w"]) -> Float[Array, "h w"]:
     between = jnp.where(total > 0, count / jnp.where(total > 0, total, 1), 0)
     filled = jnp.where(depth > 0, depth, between)
     return jnp.where(jnp.mean(filled > 0) > _STIPPLED * jnp.mean(depth > 0), filled, depth)
+
+
+def _inverse(depth: Float[Array, "h w"]) -> Float[Array, "h w"]:
+    """Inverse depth, 0 where there is none."""
+    return jnp.where(depth > 0, 1 / jnp.where(depth > 0, depth, 1), 0)
 
 
 def _first_seen(inverse: Float[Array, "h w"], row: int, column: int):
@@ -249,8 +259,7 @@ def tangent_planes(depth: Float[Array, "h w"], camera: Camera) -> Float[Array, "
     """
     rays = _rays(camera)
     direction, slopes = jnp.asarray(rays), jnp.asarray(pixel_slopes(camera, rays))
-    seen = depth > 0
-    inverse = jnp.where(seen, 1 / jnp.where(seen, depth, 1), 0)
+    seen, inverse = depth > 0, _inverse(depth)
     near = _SAME_SURFACE * depth_sigma(depth) * inverse**2
     by_x, known_x = _slope(inverse, near, axis=1)
     by_y, known_y = _slope(inverse, near, axis=0)
