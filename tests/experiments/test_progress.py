@@ -106,5 +106,5 @@ def test_a_run_is_never_silent(tmp_path):
     assert own[0] == f"  run folder {tmp_path / 'run'}"
     gaps = [later - before for before, later in zip(times, times[1:], strict=False)]
     assert max(gaps) < 5, list(zip(gaps, lines, strict=True))
-    for phase in ("compiling", "tracking", "registering", "texturing", "point cloud", "rendering", "drawing"):
+    for phase in ("compiling", "tracking", "refining", "texturing", "point cloud", "rendering", "drawing"):
         assert any(phase in text for text in own), phase

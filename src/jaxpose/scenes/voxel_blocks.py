@@ -119,21 +119,27 @@ def empty_blocks(
 
 def encoded(config: BlockConfig, values: Float[Array, "*n 8"]) -> Int[Array, "*n 8"]:
     """Channels of nodes as the pool has them; what is beyond its range is cut off."""
-    weights = jnp.sqrt(values[..., SAMPLED:] / MEMORY)
-    scaled = jnp.concatenate([values[..., :SAMPLED] / _range(config, values.ndim), weights], axis=-1)
+    return jnp.stack([encoded_channel(config, k, values[..., k]) for k in range(CHANNELS)], axis=-1)
+
+
+def encoded_channel(config: BlockConfig, k: int, values: Float[Array, "*n"]) -> Int[Array, "*n"]:
+    """`encoded` for channel k alone."""
+    scaled = values / _largest(config)[k] if k < SAMPLED else jnp.sqrt(values / MEMORY)
     whole = jnp.round(_WHOLE * jnp.clip(scaled, -1, 1))
-    least = jnp.concatenate([jnp.full_like(whole[..., :SAMPLED], -_WHOLE), jnp.sign(weights)], axis=-1)
-    return jnp.maximum(whole, least).astype(jnp.int16) - _along_last(
-        _FREE, whole.ndim
-    )  # what has a weight keeps one
+    least = -_WHOLE if k < SAMPLED else jnp.sign(scaled)  # what has a weight keeps one
+    return jnp.maximum(whole, least).astype(jnp.int16) - _FREE[k]
 
 
 def decoded(config: BlockConfig, stored: Int[Any, "*n 8"]) -> Float[Any, "*n 8"]:
     """The channels of nodes that `encoded` has made, float32; arrays stay where they are."""
-    scaled = (stored + _along_last(_FREE, stored.ndim)).astype(np.float32) / np.float32(_WHOLE)
-    join = np.concatenate if isinstance(stored, np.ndarray) else jnp.concatenate
-    weights = np.float32(MEMORY) * scaled[..., SAMPLED:] ** 2
-    return join([scaled[..., :SAMPLED] * _range(config, stored.ndim), weights], axis=-1)
+    channels = [decoded_channel(config, k, stored[..., k]) for k in range(CHANNELS)]
+    return (np if isinstance(stored, np.ndarray) else jnp).stack(channels, axis=-1)
+
+
+def decoded_channel(config: BlockConfig, k: int, stored: Int[Any, "*n"]) -> Float[Any, "*n"]:
+    """`decoded` for channel k alone."""
+    scaled = (stored + _FREE[k]).astype(np.float32) / np.float32(_WHOLE)
+    return scaled * _largest(config)[k] if k < SAMPLED else np.float32(MEMORY) * scaled**2
 
 
 def holds_surface(stored: Int[np.ndarray, "n 9 9 9 8"]) -> Bool[np.ndarray, " n"]:
@@ -142,15 +148,9 @@ def holds_surface(stored: Int[np.ndarray, "n 9 9 9 8"]) -> Bool[np.ndarray, " n"
     return (distance.min(axis=(1, 2, 3)) < 0) & (distance.max(axis=(1, 2, 3)) > 0)
 
 
-def _range(config: BlockConfig, dimensions: int = 1) -> Float[np.ndarray, "... 5"]:
-    """The largest value of each sampled channel that the pool holds, along the last of some dimensions."""
-    largest = np.array([config.truncation, 2, 2, 2, CELLS * config.voxel], np.float32)
-    return _along_last(largest, dimensions)
-
-
-def _along_last(row: Shaped[np.ndarray, " k"], dimensions: int) -> Shaped[np.ndarray, "... k"]:
-    """A row along the last of some dimensions."""
-    return row.reshape((1,) * (dimensions - 1) + (-1,))
+def _largest(config: BlockConfig) -> Float[np.ndarray, "5"]:
+    """The largest value of each sampled channel that the pool holds."""
+    return np.array([config.truncation, 2, 2, 2, CELLS * config.voxel], np.float32)
 
 
 def sample_blocks(config: BlockConfig, blocks: Blocks, point: Float[Array, "3"]) -> Float[Array, "6"]:
@@ -158,7 +158,7 @@ def sample_blocks(config: BlockConfig, blocks: Blocks, point: Float[Array, "3"])
 
     Those of free space where there is no block.
     """
-    scale = _range(config) / np.float32(_WHOLE)
+    scale = _largest(config) / np.float32(_WHOLE)
 
     def node(stored):
         known = (stored[CHANNELS - 1 :] > 0).astype(point.dtype)
@@ -213,10 +213,20 @@ def touched_blocks(
 ) -> Int[np.ndarray, "m 3"]:
     """The blocks of space within `reach` [m] of points along each axis, each once."""
     side = CELLS * config.voxel
-    first = np.unique(np.floor((points - reach) / side).astype(np.int64), axis=0)
+    first = _each_once(np.floor((points - reach) / side).astype(np.int64))
     span = int(np.ceil(2 * reach / side - 1e-9)) + 1
     offsets = np.stack(np.meshgrid(*[np.arange(span)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-    return np.unique((first[:, None] + offsets).reshape(-1, 3), axis=0)
+    return _each_once((first[:, None] + offsets).reshape(-1, 3))
+
+
+def _each_once(rows: Int[np.ndarray, "n 3"]) -> Int[np.ndarray, "m 3"]:
+    """Rows of whole numbers in order, each once, by one number for each."""
+    if not len(rows):
+        return rows
+    lower = rows.min(axis=0)
+    size = rows.max(axis=0) - lower + 1
+    number = np.unique(np.ravel_multi_index(tuple((rows - lower).T), tuple(size)))
+    return lower + np.stack(np.unravel_index(number, tuple(size)), axis=-1)
 
 
 def with_blocks(

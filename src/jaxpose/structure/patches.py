@@ -109,8 +109,11 @@ def _sample(image: Float[np.ndarray, "H W c"], xy: Float[np.ndarray, "o k 2"]) -
     column, row = x.astype(int), y.astype(int)
     right, down = ((share.astype(np.float32))[..., None] for share in (x - column, y - row))
     flat, at = image.reshape(-1, channels), row * width + column
-    above = flat[at] * (1 - right) + flat[at + 1] * right
-    return above * (1 - down) + (flat[at + width] * (1 - right) + flat[at + width + 1] * right) * down
+    above, above_right, below, below_right = (flat.take(at + k, 0) for k in (0, 1, width, width + 1))
+    above += right * (above_right - above)
+    below += right * (below_right - below)
+    above += down * (below - above)
+    return above
 
 
 def _aligned(
@@ -146,23 +149,43 @@ def _step(
     start: Float[np.ndarray, "o 10"],
 ) -> tuple[Float[np.ndarray, "o 10"], Float[np.ndarray, " o"]]:
     """What to take off `found`, and how unlike patches are there: an image and its slopes are `seen`."""
-    stretch = found[:, :4].reshape(-1, 2, 2)
-    at = place[:, None] + found[:, None, 4:6] + np.einsum("kd,ocd->okc", _GRID, stretch)
-    colour, by_x, by_y = np.split(_sample(seen, at), 3, axis=-1)
-    difference = colour - found[:, 6, None, None] * rest - found[:, None, 7:]
-    by_found = np.zeros((*rest.shape, 10), np.float32)
-    x, y = _GRID[:, :1], _GRID[:, 1:]
-    for column, part in enumerate((by_x * x, by_x * y, by_y * x, by_y * y, by_x, by_y, -rest)):
-        by_found[..., column] = part
-    by_found[..., (0, 1, 2), (7, 8, 9)] = -1
-    rows = by_found.reshape(len(place), -1, 10)
-    weighted = (rows * np.repeat(_WEIGHT, 3)[:, None]).transpose(0, 2, 1)
-    down = (weighted @ difference.reshape(len(place), -1, 1))[..., 0] + _STIFF * (found - start)
-    step = np.linalg.solve(weighted @ rows + np.diag(_STIFF + _LEAST), down[..., None])[..., 0]
-    return step, np.sqrt(np.einsum("k,okc->o", _WEIGHT, difference**2) / 3)
+    at = np.stack([place[:, k, None] + found[:, of] @ _LINEAR.T for k, of in enumerate(_OF_AXIS)], axis=-1)
+    sampled = np.ascontiguousarray(np.moveaxis(_sample(seen, at), -1, 0))  # (9, o, k)
+    colour, by_x, by_y = sampled[:3], sampled[3:6], sampled[6:]
+    rest = np.ascontiguousarray(np.moveaxis(rest, -1, 0))
+    gain, *offset = found[:, 6:].T.astype(np.float32)
+    difference = colour - gain[:, None] * rest - np.stack(offset)[..., None]
+    # By the map's numbers and the shift it is a slope times x, y or 1, so that sums of products of slopes
+    # over the patch, times those of x, y and 1, are all that equations are made of.
+    slopes, count = (by_x, by_y), len(place)
+    matrix, down = np.zeros((count, 10, 10)), np.empty((count, 10))
+    for a, b in ((0, 0), (0, 1), (1, 1)):
+        block = (_summed(slopes[a] * slopes[b]) @ _SQUARES)[:, _PAIRS]
+        matrix[:, _OF_AXIS[a][:, None], _OF_AXIS[b]] = block
+        matrix[:, _OF_AXIS[b][:, None], _OF_AXIS[a]] = block
+    for of, slope in zip(_OF_AXIS, slopes, strict=True):
+        matrix[:, of, 6] = matrix[:, 6, of] = -(_summed(slope * rest) @ _FIRST)
+        matrix[:, of, 7:] = -np.moveaxis(slope @ _FIRST, 0, -1)
+        matrix[:, 7:, of] = np.swapaxes(matrix[:, of, 7:], 1, 2)
+        down[:, of] = _summed(slope * difference) @ _FIRST
+    matrix[:, 6, 6] = _summed(rest**2) @ _WEIGHT
+    matrix[:, (7, 8, 9), (7, 8, 9)] = 1  # the rest has no mean, so that the gain leaves offsets alone
+    down[:, 6], down[:, 7:] = -(_summed(rest * difference) @ _WEIGHT), -(difference @ _WEIGHT).T
+    down += _STIFF * (found - start)
+    step = np.linalg.solve(matrix + np.diag(_STIFF + _LEAST), down[..., None])[..., 0]
+    return step, np.sqrt(_summed(difference**2) @ _WEIGHT / 3)
+
+
+def _summed(colours: Float[np.ndarray, "3 o k"]) -> Float[np.ndarray, "o k"]:
+    return colours[0] + colours[1] + colours[2]
 
 
 _ALONG = np.arange(-_HALF, _HALF + 1, dtype=np.float32)
 _GRID = np.stack(np.meshgrid(_ALONG, _ALONG), axis=-1).reshape(-1, 2)
 _WEIGHT = np.exp(-0.5 * np.sum(_GRID**2, axis=1) / _SPREAD**2)
 _WEIGHT /= _WEIGHT.sum()
+_LINEAR = np.column_stack([_GRID, np.ones_like(_WEIGHT)])  # x, y and 1,
+_OF_AXIS = np.array([[0, 1, 4], [2, 3, 5]])  # and the numbers that go with them along u and along v
+_FIRST = _WEIGHT[:, None] * _LINEAR
+_SQUARES = np.column_stack([_FIRST * _GRID[:, :1], _FIRST * _GRID[:, 1:], _WEIGHT])  # x and y times these
+_PAIRS = np.array([[0, 1, 2], [3, 4, 5], [2, 5, 6]])  # where x x, x y, x; y x, y y, y; x, y and 1 are in it

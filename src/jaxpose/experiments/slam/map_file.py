@@ -16,7 +16,7 @@ from jaxpose.scenes.voxel_blocks import (
     CHANNELS,
     NODES,
     BlockConfig,
-    decoded,
+    decoded_channel,
     of_distance_and_colour,
     packed,
     unpacked,
@@ -93,7 +93,9 @@ def _distance_and_colour(
     """The first channels of the nodes, float16, made of a few blocks at a time: memory is the file's."""
     values = np.empty((*stored.shape[:-1], _VALUES), np.float16)
     for start in range(0, len(stored), _TOGETHER):
-        values[start : start + _TOGETHER] = decoded(config, stored[start : start + _TOGETHER])[..., :_VALUES]
+        some = stored[start : start + _TOGETHER]
+        for k in range(_VALUES):
+            values[start : start + _TOGETHER, ..., k] = decoded_channel(config, k, some[..., k])
     return values
 
 

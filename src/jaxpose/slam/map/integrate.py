@@ -24,13 +24,14 @@ from jaxpose.geometry.camera import Camera, pixel_grid, pixel_slopes, unproject_
 from jaxpose.scenes.types import Params
 from jaxpose.scenes.voxel_blocks import (
     CELLS,
+    CHANNELS,
     MEMORY,
     NODES,
     SAMPLED,
     BlockConfig,
     Blocks,
-    decoded,
-    encoded,
+    decoded_channel,
+    encoded_channel,
     sample_blocks,
     touched_blocks,
     with_blocks,
@@ -39,6 +40,8 @@ from jaxpose.slam.map.photometric import MapState
 from jaxpose.slam.observation import Image, Located, depth_sigma, locate
 
 _REACH = CELLS  # voxels to either side of a surface of which the wide-band distance knows
+_TOGETHER = 64  # blocks: a megabyte and a half of each eight numbers a node
+_WEIGHED_BY = 0, 1, 1, 1, 2  # which weight each sampled channel has
 _NEAREST = 3**0.5  # voxels: nodes of the cells that hold a surface
 _CUT = 0.98  # of a distance's reach: what is nearer to its end was cut off
 _RADIUS = 4  # [px] of the window that slopes are measured in
@@ -69,11 +72,12 @@ class SurfaceObservation(NamedTuple):
 
     def distance(self, point_cam: Float[Array, "*n 3"]) -> Float[Array, "*n"]:
         """Signed distance [m] of points in camera axes to the planes, positive in front of them."""
-        return jnp.sum(self.normal * point_cam, axis=-1) + self.offset
+        return self.offset - self.incidence_cosine(point_cam)
 
     def incidence_cosine(self, point_cam: Float[Array, "*n 3"]) -> Float[Array, "*n"]:
         """How far [m] the points are from the camera along the planes' normals."""
-        return -jnp.sum(self.normal * point_cam, axis=-1)
+        (a, b, c), (x, y, z) = (jnp.moveaxis(axes, -1, 0) for axes in (self.normal, point_cam))
+        return -(a * x + b * y + c * z)
 
 
 class _Reach(NamedTuple):
@@ -94,7 +98,7 @@ def make_integrate(config: BlockConfig, camera: Camera):
     The state's parameters are `Blocks`, which hold the weights too; it has no other state.
     """
     reach = _Reach(config.truncation, _NEAREST * config.voxel, _REACH * config.voxel)
-    nodes = np.stack(np.meshgrid(*[np.arange(NODES)] * 3, indexing="ij"), axis=-1)
+    nodes = np.array(list(np.ndindex(NODES, NODES, NODES)))
     corners = CELLS * np.array(list(np.ndindex(2, 2, 2)))
     in_view = in_view_test(camera)
 
@@ -104,53 +108,52 @@ def make_integrate(config: BlockConfig, camera: Camera):
         seen_at, T_cam_world = seen_by(image, camera), se3.inverse(T_world_cam)
         position = lambda coords, within: config.voxel * (CELLS * coords + within).astype(jnp.float32)
         corner = position(blocks.coords[:, None], jnp.asarray(corners)[None])
-        row = jnp.arange(blocks.coords.shape[0])
+        capacity = blocks.coords.shape[0]
+        row = jnp.arange(capacity)
         in_sight = in_view(se3.apply(T_cam_world, corner), jnp.max(image.depth) + reach.wide)
         in_sight &= (row > 0) & (row < blocks.count)
-        order = jnp.argsort(~in_sight)  # those in sight come first
+        # Those in sight, and then rows that there are not, which are read as the last and written nowhere.
+        order = jnp.sort(jnp.where(in_sight, row, capacity))
+        order = jnp.pad(order, (0, _TOGETHER), constant_values=capacity)
 
-        def integrate_block(n, values):
-            row = order[n]
+        def integrate_some(n, values):
+            rows = jax.lax.dynamic_slice(order, (_TOGETHER * n,), (_TOGETHER,))
             points_cam = se3.apply(
-                T_cam_world, position(blocks.coords[row][None, None, None], jnp.asarray(nodes))
+                T_cam_world, position(blocks.coords[rows][:, None], jnp.asarray(nodes)[None])
             )
-            before = jax.lax.dynamic_index_in_dim(values, row, keepdims=False)
-            seen = seen_at(locate(camera, points_cam))
-            after = encoded(config, _integrated(decoded(config, before), points_cam, seen, reach))
-            return jax.lax.dynamic_update_index_in_dim(values, after, row, 0)
+            before = [decoded_channel(config, k, values[rows][..., k]) for k in range(CHANNELS)]
+            after = _integrated(before, points_cam, seen_at(locate(camera, points_cam)), reach)
+            stored = [encoded_channel(config, k, channel) for k, channel in enumerate(after)]
+            return values.at[rows].set(jnp.stack(stored, axis=-1), mode="drop")
 
-        # One block after the other, in place: what is in between stays small, whatever the map's size.
-        values = jax.lax.fori_loop(0, jnp.sum(in_sight), integrate_block, blocks.values)
-        return MapState(blocks._replace(values=values), ())
+        # Some blocks after the others, in place: what is in between stays small, whatever the map's size.
+        flat = blocks.values.reshape(capacity, len(nodes), CHANNELS)
+        flat = jax.lax.fori_loop(0, -(-jnp.sum(in_sight) // _TOGETHER), integrate_some, flat)
+        return MapState(blocks._replace(values=flat.reshape(blocks.values.shape)), ())
 
     return update
 
 
 def _integrated(
-    values: Float[Array, "*n 8"],
+    before: list[Float[Array, "*n"]],
     points_cam: Float[Array, "*n 3"],
     seen: SurfaceObservation,
     reach: _Reach,
-) -> Float[Array, "*n 8"]:
-    """Nodes at points in camera axes with what an image says of them added."""
+) -> list[Float[Array, "*n"]]:
+    """Channels of nodes at points in camera axes with what an image says of them added."""
     distance, depth = seen.distance(points_cam), points_cam[..., 2]
     # How far behind a surface a node is goes by the optical axis, as little is known there at a grazing
     # angle; but the nodes next to it are needed on both sides.
     along = distance * depth / jnp.maximum(seen.incidence_cosine(points_cam), GRAZING * depth)
     along = jnp.where(jnp.abs(distance) < reach.nearest, distance, along)
-    gain = jnp.stack([
-        jnp.where(along > -reach.band, seen.weight, 0),
-        jnp.where(jnp.abs(along) < reach.band, seen.weight, 0),
-        jnp.where(along > -reach.wide, seen.weight, 0),
-    ], axis=-1)  # fmt: skip
-    total = values[..., SAMPLED:] + gain
-    share = gain / jnp.where(total > 0, total, 1)
-    found = jnp.concatenate([
-        jnp.minimum(distance, reach.band)[..., None], seen.rgb, jnp.minimum(distance, reach.wide)[..., None]
-    ], axis=-1)  # fmt: skip
-    before = values[..., :SAMPLED]
-    mean = before + share[..., jnp.array([0, 1, 1, 1, 2])] * (found - before)
-    return jnp.concatenate([mean, jnp.minimum(total, MEMORY)], axis=-1)
+    counts = along > -reach.band, jnp.abs(along) < reach.band, along > -reach.wide
+    red, green, blue = jnp.moveaxis(seen.rgb, -1, 0)
+    found = jnp.minimum(distance, reach.band), red, green, blue, jnp.minimum(distance, reach.wide)
+    gain = [jnp.where(some, seen.weight, 0) for some in counts]
+    total = [old + new for old, new in zip(before[SAMPLED:], gain, strict=True)]
+    share = [new / jnp.where(both > 0, both, 1) for new, both in zip(gain, total, strict=True)]
+    mean = [before[k] + share[_WEIGHED_BY[k]] * (found[k] - before[k]) for k in range(SAMPLED)]
+    return mean + [jnp.minimum(weight, MEMORY) for weight in total]
 
 
 def grown_map(
@@ -201,7 +204,8 @@ def seen_by(image: Image, camera: Camera) -> Callable[[Located], SurfaceObservat
     rows = jnp.concatenate([planes, weight[..., None], rgb], axis=-1)
 
     def at(located: Located) -> SurfaceObservation:
-        row = rows[located.row, located.column]
+        # Read once, whatever is made of it: XLA would read each number anew where it is used.
+        row = jax.lax.optimization_barrier(rows[located.row, located.column])
         return SurfaceObservation(
             row[..., :3], row[..., 3], jnp.where(located.inside, row[..., 4], 0), row[..., 5:]
         )

@@ -11,11 +11,20 @@ from scipy.ndimage import map_coordinates
 
 from jaxpose.geometry import se3
 from jaxpose.geometry.camera import Camera
-from jaxpose.scenes.voxel_blocks import CELLS, SAMPLED, BlockConfig, Blocks, decoded, holds_surface, packed
+from jaxpose.scenes.voxel_blocks import (
+    CELLS,
+    SAMPLED,
+    BlockConfig,
+    Blocks,
+    decoded_channel,
+    holds_surface,
+    packed,
+)
 from jaxpose.slam.keyframes import Keyframe
 from jaxpose.slam.observation import back_project, locate, read_pixels
 
 _PENDING = 1_000_000  # points
+_TOGETHER = 256  # blocks that are taken apart at once
 _EMPTY = (
     np.zeros((0, 3)),
     np.zeros((0, 3), np.float32),
@@ -85,18 +94,23 @@ def mesh(
     from skimage.measure import marching_cubes
 
     coords, stored = packed(blocks)
-    parts, count = list[tuple[np.ndarray, ...]]([_EMPTY]), 0
-    for row in np.flatnonzero(holds_surface(stored)).tolist():
-        block, nodes = coords[row], decoded(config, stored[row])
-        # In skimage's words the triangles' front then faces growing distances: free space.
-        cells, faces, _, _ = marching_cubes(nodes[..., 0], level=0.0, gradient_direction="descent")
-        rgb = [map_coordinates(nodes[..., k], cells.T, order=1, mode="nearest") for k in (1, 2, 3)]
-        ends = (tuple(end(cells).astype(int).T) for end in (np.floor, np.ceil))
-        known = np.all([nodes[end][:, SAMPLED] > 0 for end in ends], axis=0)
-        corners = CELLS * block + cells.astype(np.float64)
-        parts.append(
-            (corners, np.stack(rgb, axis=-1), known, np.full(len(cells), row < earlier), faces + count)
+    rows, parts, count = np.flatnonzero(holds_surface(stored)), list[tuple[np.ndarray, ...]]([_EMPTY]), 0
+    for start in range(0, len(rows), _TOGETHER):
+        some = rows[start : start + _TOGETHER]
+        distance, *colour, weight = (
+            decoded_channel(config, k, stored[some, ..., k]) for k in range(SAMPLED + 1)
         )
+        # In skimage's words the triangles' front then faces growing distances: free space.
+        surfaces = [marching_cubes(nodes, level=0.0, gradient_direction="descent")[:2] for nodes in distance]
+        lengths = [len(corners) for corners, _ in surfaces]
+        block = np.repeat(np.arange(len(some)), lengths)
+        cells, faces = (np.concatenate(x) for x in zip(*surfaces, strict=True))
+        rgb = [map_coordinates(x, (block, *cells.T), order=1, mode="nearest") for x in colour[:3]]
+        low, high = ((block, *end(cells).astype(int).T) for end in (np.floor, np.ceil))
+        known, first = (weight[low] > 0) & (weight[high] > 0), count + np.cumsum([0, *lengths[:-1]])
+        faces = faces + np.repeat(first, [len(triangles) for _, triangles in surfaces])[:, None]
+        corners = CELLS * coords[some][block] + cells.astype(np.float64)
+        parts.append((corners, np.stack(rgb, axis=-1), known, some[block] < earlier, faces))
         count += len(cells)
     cells, rgb, known, before, faces = map(np.concatenate, zip(*parts, strict=True))
     del parts

@@ -17,7 +17,14 @@ from jaxpose._memory import give_back_memory
 from jaxpose.geometry import se3
 from jaxpose.geometry.camera import Camera
 from jaxpose.scenes import SceneField
-from jaxpose.scenes.voxel_blocks import CELLS, BlockConfig, Blocks, block_at, decoded, trilinear_in_block
+from jaxpose.scenes.voxel_blocks import (
+    CELLS,
+    BlockConfig,
+    Blocks,
+    block_at,
+    decoded_channel,
+    trilinear_in_block,
+)
 from jaxpose.slam.keyframes import Keyframe
 from jaxpose.slam.map.integrate import in_view_test, seen_by
 from jaxpose.slam.observation import locate
@@ -131,7 +138,7 @@ def _make_add(camera: Camera, side: float, near: float):
             seen = seen_at(at)
             same = (seen.weight > 0) & (jnp.abs(seen.distance(points_cam)) < near)
             filled = jnp.maximum(seen.incidence_cosine(points_cam), 0) / jnp.maximum(at.depth, 0.1) ** 3
-            weight = jnp.where(same, filled, 0)[:, None]
+            weight = jax.lax.optimization_barrier(jnp.where(same, filled, 0))[:, None]
             colour = weight * jnp.concatenate([seen.rgb, jnp.ones_like(weight)], axis=-1)
             return total.at[order[n]].add(colour)
 
@@ -147,7 +154,7 @@ def _near_surface(
     thick = _THICKNESS * config.voxel / _FINER
     rows, tiles, within, count = [], [], [], 0
     for part in np.array_split(np.arange(len(values)), max(len(values) // 256, 1)):
-        fine = decoded(config, values[part])[..., 0]
+        fine = decoded_channel(config, 0, values[part, ..., 0])
         part = part[close := np.abs(fine).min(axis=(1, 2, 3)) < config.voxel]
         fine = fine[close]
         for axis in (1, 2, 3):
