@@ -1,9 +1,8 @@
 """How noisy sensors and poses are, by how large residuals are beside what is expected of them."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxpose.estimate import inertial, solver
 from jaxpose.estimate.system import Noise, Problem
@@ -66,11 +65,12 @@ def calibrated(
     of poses is known where a sensor measures the same: one sensor of the two tells it for positions and
     rotations alike, none tells nothing.
     """
+    level, usual = jax.device_get((level, usual))  # few numbers: compiling takes longer than they do
     for _ in range(_ROUNDS):
-        fit = solver.spread(at)[2]
-        new = jax.tree.map(_level, level, usual, fit.squares, fit.degrees)
+        fit = jax.device_get(solver.spread(at)[2])
+        new = Noise(*map(_level, level, usual, fit.squares, fit.degrees))
         new = new._replace(**_of_poses(problem, level, new))
-        calm = all(jnp.all(jnp.abs(a / b - 1) < _CALM) for a, b in zip(new, level, strict=True))
+        calm = all(np.all(np.abs(a / b - 1) < _CALM) for a, b in zip(new, level, strict=True))
         level = new
         at = solver.optimise(problem, at.state, level, steps=1)
         if calm:
@@ -86,10 +86,10 @@ def _of_poses(problem: Problem, level: Noise, new: Noise) -> dict[str, Float[Any
     return {"position": one, "rotation": one}
 
 
-def _level(level, usual, squares, degrees) -> Float[Array, "*m"]:
+def _level(level, usual, squares, degrees) -> Float[np.ndarray, "*m"]:
     """The level of a group, if the usual one was seen `_SEEN` times."""
-    found = (squares * level**2 + _SEEN * usual**2) / (jnp.maximum(degrees, 0) + _SEEN)
-    return jnp.clip(jnp.sqrt(found), level / 3, level * 3)
+    found = (squares * level**2 + _SEEN * usual**2) / (np.maximum(degrees, 0) + _SEEN)
+    return np.asarray(np.clip(np.sqrt(found), level / 3, level * 3))
 
 
 def _restlessness(t: Float[np.ndarray, " n"], T: Float[np.ndarray, "n 4 4"]) -> tuple[float, float]:

@@ -98,6 +98,7 @@ def compiled_calls(problem: Problem, noise: Noise) -> list[tuple[Any, ...]]:
     return [(linearise, problem, problem.start, noise), (_moved, at, _DAMPING), (spread, at)]
 
 
+@jax.jit
 def pair_covariance(known: Covariance) -> Float[Array, "n 70 70"]:
     """The covariance of each pair of neighbouring blocks with the border."""
     early, late, beside = known.diagonal[:-1], known.diagonal[1:], known.lower
