@@ -27,7 +27,8 @@ from scipy.spatial.transform import Rotation
 matplotlib.use("Agg")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
-jax.config.update("jax_debug_key_reuse", True)
+if "JAX_DEBUG_KEY_REUSE" not in os.environ:
+    jax.config.update("jax_debug_key_reuse", True)
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -61,9 +62,10 @@ def dtype(request):
 @pytest.fixture
 def unchecked():
     """Run the test as users run the library: arguments reach functions whose annotations they break."""
+    before = jaxtyping.config.jaxtyping_disable
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
-    jaxtyping.config.update("jaxtyping_disable", False)
+    jaxtyping.config.update("jaxtyping_disable", before)
 
 
 @pytest.fixture
