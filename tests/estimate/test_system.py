@@ -9,9 +9,9 @@ from helpers import hand_held
 from jaxpose import fields
 from jaxpose.estimate import inertial
 from jaxpose.estimate.factors import Factor
-from jaxpose.estimate.kinematics import basis, kinematics, segments
+from jaxpose.estimate.kinematics import basis, kinematics, of_logarithm, segments
 from jaxpose.estimate.system import BLOCK, BORDER, Noise, Prior, Problem, State, residuals, retract
-from jaxpose.geometry import rigid
+from jaxpose.geometry import rigid, se3
 
 SPAN, INTERVALS = (0.0, 1.2), 6
 
@@ -103,3 +103,11 @@ def test_every_derivative_is_that_of_finite_differences(control):
                     expected[k] = J[k][..., column[k]]
                 scale = max(np.abs(J).max(), 1.0)
                 np.testing.assert_allclose(slope, expected, atol=2e-7 * scale, err_msg=f"{name} by {unknown}")
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-3, 0.0099, 0.0101, 1.0, 3.1])
+def test_a_logarithm_moves_with_its_rotation_as_forward_mode_has_it(angle):
+    with jax.enable_x64(True):
+        phi = angle * jnp.array([0.6, -0.64, 0.48])
+        moved = lambda d: se3.so3_log(se3.so3_exp(phi) @ se3.so3_exp(d))
+        np.testing.assert_allclose(of_logarithm(phi), jax.jacfwd(moved)(jnp.zeros(3)), atol=1e-14)

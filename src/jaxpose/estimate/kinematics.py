@@ -45,7 +45,7 @@ def segments(control_poses: Float[Array, "k 4 4"]) -> Segment:
     """
     relative = se3.compose(se3.inverse(control_poses[:-1]), control_poses[1:])
     increment = se3.log(relative)
-    by_next = jnp.linalg.inv(jax.vmap(right_jacobian)(increment))
+    by_next = jax.vmap(_inverse_right_jacobian)(increment)
     # exp(-d) exp(x) is exp(x) exp(-Ad(exp(-x)) d)
     by_previous = -by_next @ se3.adjoint(se3.inverse(relative))
     three = lambda x: jnp.stack([x[j : len(x) - 2 + j] for j in range(3)], axis=1)
@@ -144,6 +144,28 @@ def right_jacobian(x: Float[Array, "6"]) -> Float[Array, "6 6"]:
         return se3.exp(jnp.concatenate([unit, jnp.broadcast_to(phi, (3, 3))], axis=1))[:, :3, 3]
 
     return _of_twists(*jax.jvp(of_rotation, (x[3:],), (x[:3],)))
+
+
+def of_logarithm(phi: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    """How the logarithm of a rotation moves with it: `log(R exp(d)) = phi + J d` for small d.
+
+    Args:
+        phi: `log(R)`, less than a whole turn.
+
+    Returns:
+        J, the inverse of the rotations' right Jacobian (Sola et al. 2018, equation 144).
+    """
+    squared = jnp.sum(phi**2)
+    small = squared < 1e-4
+    half = jnp.sqrt(jnp.where(small, 1.0, squared)) / 2
+    factor = jnp.where(small, 1 / 12 + squared / 720, (1 - half / jnp.tan(half)) / (4 * half**2))
+    W = se3.hat(phi)
+    return jnp.eye(3, dtype=phi.dtype) + W / 2 + factor * W @ W
+
+
+def _inverse_right_jacobian(x: Float[Array, "6"]) -> Float[Array, "6 6"]:
+    turn = of_logarithm(x[3:])
+    return _of_twists(turn, -turn @ right_jacobian(x)[:3, 3:] @ turn)
 
 
 def _of_twists(turn: Float[Array, "3 3"], beside: Float[Array, "3 3"]) -> Float[Array, "6 6"]:

@@ -21,7 +21,16 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxpose.estimate.blocks import Blocks
 from jaxpose.estimate.factors import Factor, linearised
 from jaxpose.estimate.inertial import NODES, PLACES, lagrange
-from jaxpose.estimate.kinematics import Kinematics, Segment, ad, basis, kinematics, segments
+from jaxpose.estimate.kinematics import (
+    Kinematics,
+    Segment,
+    ad,
+    basis,
+    kinematics,
+    of_logarithm,
+    right_jacobian,
+    segments,
+)
 from jaxpose.estimate.rows import Rows, robust, robust_cost
 from jaxpose.geometry import se3
 from jaxpose.imu.types import AnyArray
@@ -192,15 +201,19 @@ def _poses(
     late = (((index % 3).astype(place.dtype) + place) / 3)[:, None]
     drift = (1 - late) * state.drift[pair] + late * state.drift[pair + 1]
 
-    def residual(increment, drift, T, T_measured):
-        T = se3.compose(se3.exp(drift), se3.compose(T, se3.exp(increment[:6])))
-        position = jnp.exp(-increment[6]) * shrunk * T[:3, 3] - T_measured[:3, 3]
-        turn = se3.so3_log(T_measured[:3, :3].T @ T[:3, :3])
-        return jnp.concatenate([T_measured[:3, :3].T @ position, turn])
+    def residual(drift, T, T_measured):
+        """With its derivatives by the camera's increment and the scale, and by the drift."""
+        moved = se3.compose(se3.exp(drift), T)
+        turned = T_measured[:3, :3].T @ moved[:3, :3]
+        placed, turn = shrunk * T_measured[:3, :3].T @ moved[:3, 3], se3.so3_log(turned)
+        upper = jnp.concatenate([shrunk * turned, jnp.zeros((3, 3), turn.dtype), -placed[:, None]], axis=1)
+        lower = jnp.zeros((3, 7), turn.dtype).at[:, 3:6].set(of_logarithm(turn))
+        by_pose = jnp.concatenate([upper, lower])
+        by_drift = by_pose[:, :6] @ se3.adjoint(se3.inverse(T)) @ right_jacobian(drift)
+        r = jnp.concatenate([placed - T_measured[:3, :3].T @ T_measured[:3, 3], turn])
+        return r, by_pose, by_drift
 
-    none = jnp.zeros(7, state.control.dtype)
-    r = jax.vmap(residual, (None, 0, 0, 0))(none, drift, found, problem.T)
-    by_pose, by_drift = jax.vmap(jax.jacfwd(residual, (0, 1)), (None, 0, 0, 0))(none, drift, found, problem.T)
+    r, by_pose, by_drift = jax.vmap(residual)(drift, found, problem.T)
     slope = (state.drift[pair + 1] - state.drift[pair]) / (3 * problem.interval_s)
     J = by_pose[..., :6] @ J
     J = J.at[..., 24 + OFFSET.start].add(jnp.einsum("pij,pj->pi", by_drift, slope))
