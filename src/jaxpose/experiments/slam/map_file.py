@@ -1,5 +1,6 @@
 """The map of a SLAM run as its folder keeps it, `map.npz`."""
 
+import zipfile
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -29,6 +30,7 @@ _VERSION = 4
 _VALUES = 4  # of the channels of a node: distance and colour
 _STEP, _MOST_STEPS = 256, 127  # of numbers of 16 bits
 _TOGETHER = 256  # blocks
+_EFFORT = 4  # of compression: half the time of numpy's 6 for 3% more bytes
 _DESCRIPTOR = 32  # bytes
 _LARGEST_M = 1e4  # of voxels and distances
 _FARTHEST_BLOCK = 1023  # from the origin: a table of 256^3 bricks
@@ -59,7 +61,10 @@ def write_map(path: Path | str, saved: SavedMap) -> None:
         "texture_tiles": np.asarray(saved.texture.tiles),
     }
     with atomic.atomic(path) as temporary:
-        np.savez_compressed(temporary, allow_pickle=False, version=_VERSION, **arrays)
+        with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED, compresslevel=_EFFORT) as archive:
+            for name, array in {"version": _VERSION, **arrays}.items():
+                with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
+                    np.lib.format.write_array(file, np.asarray(array), allow_pickle=False)
 
 
 def _coarsened(fusion: Int[np.ndarray, "n 9 9 9 4"]) -> Int[np.ndarray, "n 9 9 9 4"]:
