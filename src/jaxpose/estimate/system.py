@@ -196,19 +196,17 @@ def _poses(
     """Camera poses: position in the measured camera's axes [its units], and rotation."""
     found, J = jax.vmap(_camera, (0, None))(at, state)
     shrunk = jnp.exp(-state.log_scale)
-    _, place = _where(problem, state, problem.t + state.offset_s)
-    pair = index // 3
+    (_, place), pair = _where(problem, state, problem.t + state.offset_s), index // 3
     late = (((index % 3).astype(place.dtype) + place) / 3)[:, None]
     drift = (1 - late) * state.drift[pair] + late * state.drift[pair + 1]
 
     def residual(drift, T, T_measured):
         """With its derivatives by the camera's increment and the scale, and by the drift."""
         moved = se3.compose(se3.exp(drift), T)
-        turned = T_measured[:3, :3].T @ moved[:3, :3]
-        placed, turn = shrunk * T_measured[:3, :3].T @ moved[:3, 3], se3.so3_log(turned)
+        turned, placed = T_measured[:3, :3].T @ moved[:3, :3], shrunk * T_measured[:3, :3].T @ moved[:3, 3]
+        turn = se3.so3_log(turned)
         upper = jnp.concatenate([shrunk * turned, jnp.zeros((3, 3), turn.dtype), -placed[:, None]], axis=1)
-        lower = jnp.zeros((3, 7), turn.dtype).at[:, 3:6].set(of_logarithm(turn))
-        by_pose = jnp.concatenate([upper, lower])
+        by_pose = jnp.concatenate([upper, jnp.pad(of_logarithm(turn), [(0, 0), (3, 1)])])
         by_drift = by_pose[:, :6] @ se3.adjoint(se3.inverse(T)) @ right_jacobian(drift)
         r = jnp.concatenate([placed - T_measured[:3, :3].T @ T_measured[:3, 3], turn])
         return r, by_pose, by_drift
