@@ -3,7 +3,14 @@
 import jax.numpy as jnp
 import numpy as np
 
-from jaxpose.scenes.voxel_blocks import CELLS, empty_blocks, of_distance_and_colour, with_blocks
+from jaxpose.scenes.voxel_blocks import (
+    CELLS,
+    CHANNELS,
+    decoded_channel,
+    empty_blocks,
+    of_distance_and_colour,
+    with_blocks,
+)
 
 
 def over_box(config, lower, upper):
@@ -12,6 +19,11 @@ def over_box(config, lower, upper):
     ranges = [np.arange(low, high + 1) for low, high in corners.T]
     coords = np.stack(np.meshgrid(*ranges, indexing="ij"), axis=-1).reshape(-1, 3)
     return with_blocks(config, empty_blocks(config, capacity=len(coords) + 1, side=4, bricks=64), coords)
+
+
+def decoded(config, stored):
+    """All channels of nodes (..., 8) as they were before they were stored."""
+    return np.stack([decoded_channel(config, k, stored[..., k]) for k in range(CHANNELS)], axis=-1)
 
 
 def node_positions(config, blocks):

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers.blocks import decoded
 from numpy.testing import assert_allclose, assert_array_equal
 
 from jaxpose.scenes.voxel_blocks import (
@@ -13,7 +14,6 @@ from jaxpose.scenes.voxel_blocks import (
     BlockConfig,
     PoolFull,
     block_at,
-    decoded,
     empty_blocks,
     encoded,
     holds_surface,

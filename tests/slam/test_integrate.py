@@ -7,13 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers.blocks import node_positions, over_box
+from helpers.blocks import decoded, node_positions, over_box
 from helpers.wall import CAMERA, wall
 from numpy.testing import assert_allclose, assert_array_equal
 
 from jaxpose.scenes import GridConfig, grid, merge
 from jaxpose.scenes import node_positions as grid_positions
-from jaxpose.scenes.voxel_blocks import BlockConfig, decoded, empty_blocks
+from jaxpose.scenes.voxel_blocks import BlockConfig, empty_blocks
 from jaxpose.slam.config import MapConfig, SampleConfig
 from jaxpose.slam.map.integrate import grown_map, make_integrate, sample_map
 from jaxpose.slam.map.photometric import MapState, make_descend

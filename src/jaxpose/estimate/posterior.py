@@ -178,11 +178,16 @@ _camera_rows = jax.jit(camera_rows)
 
 def posterior_calls(problem: Problem, noise: Noise, span: Span) -> list[tuple[Any, ...]]:
     """The compiled functions that a posterior asks, each with arguments of such shapes."""
-    factor = jax.eval_shape(lambda *x: solver.spread(solver.linearise(*x))[0], problem, problem.start, noise)
+    spread = lambda *x: solver.spread(solver.linearise(*x))[:2]
+    factor, known = jax.eval_shape(spread, problem, problem.start, noise)
     times = jax.ShapeDtypeStruct((_TOGETHER,), np.float64)
     rows = jax.eval_shape(camera_rows, problem, problem.start, times)
     _, J, pair = (jax.ShapeDtypeStruct((len(table_times(span)[1]), *x.shape[1:]), x.dtype) for x in rows)
-    return [(_camera_rows, problem, problem.start, times), (_joint, factor, J, pair, J, pair)]
+    return [
+        (_camera_rows, problem, problem.start, times),
+        (solver.pair_covariance, known),
+        (_joint, factor, J, pair, J, pair),
+    ]
 
 
 def posterior_of(

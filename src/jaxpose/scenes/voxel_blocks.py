@@ -130,14 +130,8 @@ def encoded_channel(config: BlockConfig, k: int, values: Float[Array, "*n"]) -> 
     return jnp.maximum(whole, least).astype(jnp.int16) - _FREE[k]
 
 
-def decoded(config: BlockConfig, stored: Int[Any, "*n 8"]) -> Float[Any, "*n 8"]:
-    """The channels of nodes that `encoded` has made, float32; arrays stay where they are."""
-    channels = [decoded_channel(config, k, stored[..., k]) for k in range(CHANNELS)]
-    return (np if isinstance(stored, np.ndarray) else jnp).stack(channels, axis=-1)
-
-
 def decoded_channel(config: BlockConfig, k: int, stored: Int[Any, "*n"]) -> Float[Any, "*n"]:
-    """`decoded` for channel k alone."""
+    """Channel k of nodes from what `encoded` has made of it, float32; arrays stay where they are."""
     scaled = (stored + _FREE[k]).astype(np.float32) / np.float32(_WHOLE)
     return scaled * _largest(config)[k] if k < SAMPLED else np.float32(MEMORY) * scaled**2
 

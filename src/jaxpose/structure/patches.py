@@ -127,9 +127,9 @@ def _aligned(
     found = np.tile(_START, (len(place), 1))
     found[:, 7:] = patches.mean
     start, unlike = found.copy(), np.full(len(place), np.inf)
-    moving = np.arange(len(place))
+    rest, moving = np.ascontiguousarray(np.moveaxis(patches.rest, -1, 0)), np.arange(len(place))
     for _ in range(_STEPS):
-        step, unlike[moving] = _step(seen, place[moving], patches.rest[moving], found[moving], start[moving])
+        step, unlike[moving] = _step(seen, place[moving], rest[:, moving], found[moving], start[moving])
         found[moving] -= step
         found[moving, :4] = np.clip(found[moving, :4], _START[:4] - 0.7, _START[:4] + 0.7)
         found[moving, 4:6] = np.clip(found[moving, 4:6], -4, 4)
@@ -144,7 +144,7 @@ def _aligned(
 def _step(
     seen: Float[np.ndarray, "H W 9"],
     place: Float[np.ndarray, "o 2"],
-    rest: Float[np.ndarray, "o k 3"],
+    rest: Float[np.ndarray, "3 o k"],
     found: Float[np.ndarray, "o 10"],
     start: Float[np.ndarray, "o 10"],
 ) -> tuple[Float[np.ndarray, "o 10"], Float[np.ndarray, " o"]]:
@@ -152,7 +152,6 @@ def _step(
     at = np.stack([place[:, k, None] + found[:, of] @ _LINEAR.T for k, of in enumerate(_OF_AXIS)], axis=-1)
     sampled = np.ascontiguousarray(np.moveaxis(_sample(seen, at), -1, 0))  # (9, o, k)
     colour, by_x, by_y = sampled[:3], sampled[3:6], sampled[6:]
-    rest = np.ascontiguousarray(np.moveaxis(rest, -1, 0))
     gain, *offset = found[:, 6:].T.astype(np.float32)
     difference = colour - gain[:, None] * rest - np.stack(offset)[..., None]
     # By the map's numbers and the shift it is a slope times x, y or 1, so that sums of products of slopes

@@ -98,14 +98,14 @@ def mesh(
     for start in range(0, len(rows), _TOGETHER):
         some = rows[start : start + _TOGETHER]
         distance, *colour, weight = (
-            decoded_channel(config, k, stored[some, ..., k]) for k in range(SAMPLED + 1)
+            decoded_channel(config, k, stored[some, ..., k]) for k in (0, 1, 2, 3, SAMPLED)
         )
         # In skimage's words the triangles' front then faces growing distances: free space.
         surfaces = [marching_cubes(nodes, level=0.0, gradient_direction="descent")[:2] for nodes in distance]
         lengths = [len(corners) for corners, _ in surfaces]
         block = np.repeat(np.arange(len(some)), lengths)
         cells, faces = (np.concatenate(x) for x in zip(*surfaces, strict=True))
-        rgb = [map_coordinates(x, (block, *cells.T), order=1, mode="nearest") for x in colour[:3]]
+        rgb = [map_coordinates(x, (block, *cells.T), order=1, mode="nearest") for x in colour]
         low, high = ((block, *end(cells).astype(int).T) for end in (np.floor, np.ceil))
         known, first = (weight[low] > 0) & (weight[high] > 0), count + np.cumsum([0, *lengths[:-1]])
         faces = faces + np.repeat(first, [len(triangles) for _, triangles in surfaces])[:, None]

@@ -138,7 +138,7 @@ def _make_add(camera: Camera, side: float, near: float):
             seen = seen_at(at)
             same = (seen.weight > 0) & (jnp.abs(seen.distance(points_cam)) < near)
             filled = jnp.maximum(seen.incidence_cosine(points_cam), 0) / jnp.maximum(at.depth, 0.1) ** 3
-            weight = jax.lax.optimization_barrier(jnp.where(same, filled, 0))[:, None]
+            weight = jnp.where(same, filled, 0)[:, None]
             colour = weight * jnp.concatenate([seen.rgb, jnp.ones_like(weight)], axis=-1)
             return total.at[order[n]].add(colour)
 
