@@ -326,7 +326,7 @@ def test_rough_poses_of_files_give_way_and_held_out_views_are_on_the_trajectory(
         imageio.imwrite(tmp_path / name, rgb)
     rough = photographs._replace(T_world_cam=photographs.T_world_cam @ turned)
     write_transforms(tmp_path / "transforms.json", rough)
-    config = Config(data=tmp_path, noise="none", image_width=64, steps=400, rays=256, test_pose_steps=0)
+    config = Config(data=tmp_path, noise="none", image_width=64, steps=300, rays=256, test_pose_steps=0)
     outcome = noisy_nerf.run(replace(config, out=tmp_path / "run"))
     assert outcome.results["registration"]["given_poses_kept"] is False
     assert "where the trajectory is" in outcome.results["protocol"]["image_metrics"]
@@ -362,7 +362,7 @@ def test_photographs_exposed_differently_are_brought_to_one_exposure(tmp_path):
 def test_poses_by_features_and_a_scene_of_planes(tmp_path, monkeypatch):
     """Half of the orbit, small; killed and resumed it ends with the same numbers, and is read again."""
     config = Config(
-        orbit_views=50, image_width=72, steps=400, rays=512, test_pose_steps=0, out=tmp_path / "whole"
+        orbit_views=50, image_width=72, steps=200, rays=512, test_pose_steps=0, out=tmp_path / "whole"
     )
     whole = noisy_nerf.run(config).results
     assert whole["start"]["rotation_error_deg"] > 5
@@ -371,7 +371,7 @@ def test_poses_by_features_and_a_scene_of_planes(tmp_path, monkeypatch):
     assert whole["psnr"] > 18
 
     def killed(update):
-        if update.phase == "training" and update.done == 200:
+        if update.phase == "training" and update.done == 100:
             raise KeyboardInterrupt
 
     monkeypatch.setattr("jaxpose.experiments.training_loop._SAVE_EVERY_S", 0.0)

@@ -5,7 +5,7 @@ import pytest
 from helpers import hand_held
 
 from jaxpose.geometry import rigid
-from jaxpose.slam.batch import own_covariances, tracked_covariances
+from jaxpose.slam.batch import inflation, own_covariances, tracked_covariances
 from jaxpose.slam.types import TrackingStatus, no_frames
 
 OWN = np.repeat([0.004, 0.003], 3)
@@ -71,3 +71,25 @@ def test_frames_in_doubt_have_no_covariance_of_their_own():
     ended = own_covariances(frames.put(19, status=TrackingStatus.LOST))
     np.testing.assert_allclose(ended[19], np.eye(6))  # not known, but there
     assert np.isnan(own_covariances(no_frames(np.arange(3.0)))).all()
+
+
+@pytest.mark.parametrize("larger", [0.5, 1.0, 3.0])
+def test_covariances_are_to_explain_what_other_poses_of_keyframes_differ_by(larger):
+    """Errors of the same law as is stated, and of half and three times its size; one keyframe is far off."""
+    t = np.arange(0.0, 120.0, 0.25)
+    truth, rng = hand_held.body(t)[0], np.random.default_rng(1)
+    frames = no_frames(t)
+    frames = frames.put(np.arange(len(t)), covariance=np.diag(OWN**2), status=TrackingStatus.TRACKED)
+    frames = frames.put(33, status=TrackingStatus.LOST)  # says nothing of itself
+    shared, T = np.eye(4), truth.copy()
+    for i, (step, own) in enumerate(larger * rng.normal(size=(len(t), 2, 6)) * OWN):
+        if i and i != 33:
+            shared = shared @ truth[i] @ rigid.exp(step) @ rigid.inverse(truth[i])
+        T[i] = shared @ truth[i] @ rigid.exp(own)
+    keyframes = np.sort(rng.permutation(len(t))[:300])
+    other = truth[keyframes]
+    other[100, 0, 3] += 5.0
+    found = inflation(frames, T, keyframes, other)
+    assert found == pytest.approx(max(larger**2, 1.0), rel=0.15)
+    short = inflation(frames.put(np.arange(len(t)), t=t / 1000), T, keyframes, other)  # 0.1 s in all
+    assert np.isfinite(short) and short >= 1

@@ -6,6 +6,7 @@ import pytest
 from jaxpose.datasets.synthetic import RoomConfig, room
 from jaxpose.evaluation import trajectory_error
 from jaxpose.slam import SlamConfig
+from jaxpose.slam.batch import final_trajectory
 from jaxpose.slam.loops.bundle import adopt, propose
 from jaxpose.slam.pipeline import track_all
 
@@ -24,8 +25,10 @@ def test_poses_are_nearer_to_the_truth_and_the_map_is_made_anew(sensor):
     poses = lambda frames: frames.T_world_body @ state.T_body_cam
     error = lambda frames: trajectory_error.ate(poses(frames), walk.T_world_cam).rmse
     found = propose(state, walk.read, lambda done, total: seen.append((done, total)))
-    assert found is not None and found.agrees and 0.9 < found.depths_apart < 1.05
-    after = adopt(state, found, walk.read)
+    assert found is not None and found.agrees and found.inflation == 1 and 0.9 < found.depths_apart < 1.05
+    mapped = []
+    after = adopt(state, found, walk.read, lambda done, total: mapped.append((done, total)))
+    assert mapped == [(i + 1, len(mapped)) for i in range(before.mapped.sum())]
     moved = np.linalg.norm((poses(after.frames) - poses(before))[before.keyframe][:, :3, 3], axis=1)
     assert moved.max() == pytest.approx(found.moved_max, rel=1e-6)
     assert error(after.frames) < 0.6 * error(before)
@@ -51,6 +54,10 @@ def test_nothing_is_changed_where_colour_is_beside_the_depth():
     state = tracked(walk._replace(read=read))
     found = propose(state, read)
     assert found is not None and not found.agrees
+    assert found.inflation > 4, "a contradiction, so that both are less sure than they say"
+    known, inflated = (final_trajectory(state, None, by).covariances for by in (1.0, found.inflation))
+    np.testing.assert_allclose(inflated.pose[0], found.inflation * known.pose[0], rtol=1e-6)
+    assert (inflated.second[:, 0, 0] > 4 * known.second[:, 0, 0]).all()
     T, truth = (x[found.keyframes] for x in (state.frames.T_world_body @ state.T_body_cam, walk.T_world_cam))
     assert trajectory_error.ate(found.T_world_cam, truth).rmse > 2 * trajectory_error.ate(T, truth).rmse
     few = state.frames.put(np.arange(2, state.frames.count), keyframe=False)

@@ -8,7 +8,7 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxpose.estimate import Posterior, smooth
 from jaxpose.estimate.posterior import table_times
@@ -22,6 +22,8 @@ _FEWEST = 4  # poses that an estimate can be made of
 _UNKNOWN = 1.0  # [m, rad] sigma of a pose that ends the run and is in doubt
 SEEN_AGAIN_S = 4.0  # in which the map's error is forgotten: experiments/estimate.md
 _RESOLVED = 1e-5  # [m, rad] that poses in float32 resolve
+_SAME_TIME = 1e-6  # [s]
+_MEDIAN_SQUARE = 5.348  # of chi-squared of six numbers
 _ALIKE = 4  # registered frames to either side whose covariances are averaged: that of one is of 16 numbers
 
 
@@ -37,7 +39,7 @@ class FinalTrajectory(NamedTuple):
     covariances: Covariances | None  # of it; None where a PoseNet tracked, and of too few registered frames
 
 
-def final_trajectory(state: SlamState, imu: Imu | None) -> FinalTrajectory:
+def final_trajectory(state: SlamState, imu: Imu | None, inflation: float = 1.0) -> FinalTrajectory:
     """The most likely trajectory where readings tell more than poses, else a field through all poses.
 
     A field through poses is a B-spline with a knot a frame: a PoseNet over the same 12 s of the default room
@@ -46,12 +48,13 @@ def final_trajectory(state: SlamState, imu: Imu | None) -> FinalTrajectory:
     Args:
         state: a run of at least two frames.
         imu: all readings, on the clock of the frames.
+        inflation: what covariances by the images are to be multiplied by.
 
     Returns:
         The trajectory.
     """
     frames = state.frames
-    posterior, by_images = estimate_trajectory(state, imu)
+    posterior, by_images = estimate_trajectory(state, imu, inflation)
     tracked, t = frames.T_world_body @ state.T_body_cam, frames.t - frames.t[0]
     if posterior is None:
         intervals = max(round(t[-1] / float(np.median(np.diff(t)))), 1)
@@ -66,7 +69,9 @@ def final_trajectory(state: SlamState, imu: Imu | None) -> FinalTrajectory:
     return FinalTrajectory(T_world_cam, *posterior.field(), off_m, off_deg, posterior, known)
 
 
-def estimate_trajectory(state: SlamState, imu: Imu | None) -> tuple[Posterior | None, Covariances | None]:
+def estimate_trajectory(
+    state: SlamState, imu: Imu | None, inflation: float = 1.0
+) -> tuple[Posterior | None, Covariances | None]:
     """The trajectory that poses and readings together make most likely, on the clock of the first frame.
 
     Frames that were not registered say nothing: the readings bridge them. Both sensors together take the
@@ -76,6 +81,7 @@ def estimate_trajectory(state: SlamState, imu: Imu | None) -> tuple[Posterior | 
     Args:
         state: a run.
         imu: all readings, on the clock of the frames.
+        inflation: what covariances by the images are to be multiplied by.
 
     Returns:
         The posterior: None without readings that the run uses, with too few registered frames, and where a
@@ -90,7 +96,7 @@ def estimate_trajectory(state: SlamState, imu: Imu | None) -> tuple[Posterior | 
     own, t = own[kept], frames.t[kept] - frames.t[0]
     T_world_cam = frames.T_world_body[kept] @ state.T_body_cam
     if imu is None or not config.uses_gyroscope:
-        return None, tracked_covariances(t, T_world_cam, own)
+        return None, tracked_covariances(t, T_world_cam, inflation * own)
     use = {"accelerometer": ("accelerometer",), "combined": ("gyroscope", "accelerometer")}
     estimated = partial(
         smooth,
@@ -109,7 +115,7 @@ def estimate_trajectory(state: SlamState, imu: Imu | None) -> tuple[Posterior | 
         posterior = estimated(drift=own, drift_s=SEEN_AGAIN_S)
         if max(posterior.noise.position, posterior.noise.rotation) < 1:
             return posterior, None
-    return estimated(), tracked_covariances(t, T_world_cam, own)
+    return estimated(), tracked_covariances(t, T_world_cam, inflation * own)
 
 
 def estimated_beside_poses(config: SlamConfig) -> tuple[str, ...]:
@@ -135,6 +141,50 @@ def own_covariances(frames: Frames) -> Float[np.ndarray, "n 6 6"]:
     return found
 
 
+def inflation(
+    frames: Frames,
+    T_world_cam: Float[np.ndarray, "n 4 4"],
+    keyframes: Int[np.ndarray, " k"],
+    T_other: Float[np.ndarray, "k 4 4"],
+) -> float:
+    """What covariances of tracked poses are to be multiplied by, so that they explain what others differ by.
+
+    Errors that all frames of a camera have in common leave no trace in how well each fits the map. Poses by
+    other means show them: the squared distances of moves of a second, over the covariances of these.
+
+    Args:
+        frames: of a run.
+        T_world_cam: their poses as tracked.
+        keyframes: which frames are also known otherwise.
+        T_other: their poses by these means.
+
+    Returns:
+        1 or more.
+    """
+    own = own_covariances(frames)
+    of_map = _of_map(T_world_cam, np.nan_to_num(own))
+    places = np.flatnonzero(np.isfinite(own[keyframes]).all(axis=(1, 2)))
+    i, t = keyframes[places], frames.t[keyframes[places]]
+    later = np.searchsorted(t, t + 1.0 - _SAME_TIME)
+    first = np.flatnonzero(later < len(i)) if later[0] < len(i) else np.zeros(1, int)
+    last = np.minimum(later[first], len(i) - 1)
+    a, b = i[first], i[last]
+    T_b, moved = rigid.inverse(T_world_cam[b]), rigid.inverse(T_world_cam[a]) @ T_world_cam[b]
+    otherwise = rigid.inverse(T_other[places[first]]) @ T_other[places[last]]
+    off = rigid.log(rigid.inverse(moved) @ otherwise)
+    known = rigid.carried(T_b, of_map[b] - of_map[a]) + rigid.carried(rigid.inverse(moved), own[a]) + own[b]
+    squares = np.einsum("ni,ni->n", off, np.linalg.solve(known, off[..., None])[..., 0])
+    return max(float(np.median(squares)) / _MEDIAN_SQUARE, 1.0)
+
+
+def _of_map(
+    T_world_cam: Float[np.ndarray, "n 4 4"], own: Float[np.ndarray, "n 6 6"]
+) -> Float[np.ndarray, "n 6 6"]:
+    """The walk of the map's error since the first pose, over increments on the left of poses."""
+    added = np.cumsum(rigid.carried(T_world_cam, own)[1:], axis=0)
+    return np.concatenate([np.zeros((1, 6, 6)), added])
+
+
 def tracked_covariances(
     t: Float[np.ndarray, " n"], T_world_cam: Float[np.ndarray, "n 4 4"], own: Float[np.ndarray, "n 6 6"]
 ) -> Covariances:
@@ -152,8 +202,7 @@ def tracked_covariances(
     Returns:
         Covariances of poses, and of moves of one second.
     """
-    added = np.cumsum(rigid.carried(T_world_cam, own)[1:], axis=0)
-    added = np.concatenate([np.zeros((1, 6, 6)), added])
+    added = _of_map(T_world_cam, own)
     step, dt = rigid.log(rigid.inverse(T_world_cam[:-1]) @ T_world_cam[1:]), np.diff(t)
     change = (step[1:] / dt[1:, None] - step[:-1] / dt[:-1, None]) / ((dt[1:] + dt[:-1]) / 2)[:, None]
     density = (

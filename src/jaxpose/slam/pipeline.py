@@ -151,8 +151,8 @@ def run(
         if config.uses_bundle and state.earlier is None:  # whose map's poses are not to be changed
             bundle = propose(state, recording.read, on_refined)
             if bundle is not None and bundle.agrees:
-                state = adopt(state, bundle, recording.read)
-    found = _final(state, recording.imu)
+                state = adopt(state, bundle, recording.read, on_refined)
+    found = _final(state, recording.imu, 1.0 if bundle is None else bundle.inflation)
     if found.posterior is not None and not state.passes and told_wrongly(state, found.posterior):
         return run(recording, config, on_frame, begun_again(state, found.posterior), on_refined)
     return _summed_up(state, recording.read, found, bundle)
@@ -180,7 +180,6 @@ def track_all(
             state = _advance(state, frame, t, readings, recording.read)
         except DataError as error:
             raise DataError(f"{recording.name}: {error}") from None
-        jax.block_until_ready(state.map)
         state = state._replace(frames=state.frames.put(i, seconds=time.perf_counter() - started))
         if on_frame is not None:
             on_frame(Progress(i, len(recording.t), state, _ground_truth_error(recording, state)))
@@ -217,11 +216,11 @@ def _advance(state: SlamState, frame: Frame, t: float, imu: Imu | None, read: Fr
     used, _ = pool_size(state)
     state = with_room(frame, points, state, read)
     image = image._replace(exposure=state.exposure)
-    state = map_frame(state, image, points, read, generator, map_key)
     if predicted is None:
         compile_search(state, image)
     elif used:
         compile_growth(state, used, image, predicted)
+    state = map_frame(state, image, points, read, generator, map_key)
     if state.frames.keyframe[i]:
         added = lambda kept, new: np.concatenate([kept, new[None]])
         state = state._replace(
@@ -263,11 +262,11 @@ def _refit(camera: Camera, config: SlamConfig):
     return make_refit(*framed.parts, angle_of_view(camera)[0])
 
 
-def _final(state: SlamState, imu: Imu | None) -> FinalTrajectory:
+def _final(state: SlamState, imu: Imu | None, inflation: float = 1.0) -> FinalTrajectory:
     """One continuous trajectory, by all readings or else through all poses."""
     if (count := state.frames.count) < 2:
         raise DataError(f"SLAM: expected at least 2 frames, got {count}")
-    return final_trajectory(state, imu)
+    return final_trajectory(state, imu, inflation)
 
 
 def _summed_up(

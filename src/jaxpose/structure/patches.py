@@ -5,7 +5,9 @@ found in each other one by its colours, up to an affine map of the plane, a gain
 (Lucas and Kanade 1981; Shi and Tomasi 1994).
 """
 
+from collections import deque
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import NamedTuple
 
 import cv2
@@ -18,6 +20,7 @@ _STEPS, _SETTLED = 15, 5e-3  # at most so many, and the move below which there a
 _FARTHEST = 1.5  # [px] from where the feature was found: beyond it another one is
 _STRETCH = 0.6  # at least this, and at most one over it, in any direction
 _UNLIKE = 0.5  # of the patch's contrast, that the photographs differ by at most
+_AT_ONCE = 2  # photographs
 _FAINTEST = 1 / 255  # contrast of a patch that is more than rounding
 # The affine map's four numbers, shift, gain and three offsets at the start; squared colours that it takes to
 # move the four by one, and what keeps the others' equations solvable.
@@ -75,14 +78,25 @@ def align_patches(
     contrast = np.sqrt(np.einsum("k,okc->o", _WEIGHT, rest**2) / 3)
     found, moved = is_reference.copy(), pixel.copy()
     found[is_reference] = contrast > _FAINTEST
-    for index in views:
-        rows = np.flatnonzero((view == index) & ~is_reference & found[of])
-        if len(rows):
-            patches = _Patches(*(each[slot[of[rows]]] for each in (mean, rest, contrast)))
-            shift, good = _aligned(_smooth(read(index), enlarged), place[rows], patches)
-            good &= np.linalg.norm(shift, axis=1) < _FARTHEST * enlarged
-            moved[rows[good]] += shift[good] / enlarged
-            found[rows] = good
+    others = ~is_reference & found[of]
+
+    def align(image: UInt8[np.ndarray, "h w 3"], rows: Int[np.ndarray, " n"]) -> None:
+        patches = _Patches(*(each[slot[of[rows]]] for each in (mean, rest, contrast)))
+        shift, good = _aligned(_smooth(image, enlarged), place[rows], patches)
+        good &= np.linalg.norm(shift, axis=1) < _FARTHEST * enlarged
+        moved[rows[good]] += shift[good] / enlarged
+        found[rows] = good
+
+    with ThreadPoolExecutor(_AT_ONCE) as workers:  # numpy lets go of Python's lock
+        begun = deque[Future[None]]()
+        for index in views:
+            rows = np.flatnonzero((view == index) & others)
+            if len(rows):
+                begun.append(workers.submit(align, read(index), rows))
+            if len(begun) > _AT_ONCE:
+                begun.popleft().result()
+        for each in begun:
+            each.result()
     alone = np.bincount(point[found], minlength=int(point.max(initial=-1)) + 1)[point] < 2
     return Aligned(moved, found & ~alone)
 

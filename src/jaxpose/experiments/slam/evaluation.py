@@ -119,8 +119,13 @@ def bundle_numbers(result: SlamResult) -> dict[str, Any] | None:
     found = result.bundle
     if found is None:
         return None
-    numbers = {"moved_max_m": found.moved_max, "depths_apart": found.depths_apart, "taken": found.agrees}
-    return {"keyframes": len(found.keyframes), **numbers}
+    return {
+        "keyframes": len(found.keyframes),
+        "moved_max_m": found.moved_max,
+        "depths_apart": found.depths_apart,
+        "taken": found.agrees,
+        "inflation": found.inflation,
+    }
 
 
 def freedom(recording: Recording, result: SlamResult) -> Freedom | None:

@@ -148,7 +148,11 @@ def _bundle(results: dict[str, Any]) -> list[str]:
             _line("bundle", f"{bundle['keyframes']} keyframes adjusted together, which moved them {moved}")
         ]
     worse = f"{bundle['depths_apart']:.2f} times as far apart"
-    return [_line("bundle", f"not taken: depth images are {worse} where features have the keyframes")]
+    lines = [_line("bundle", f"not taken: depth images are {worse} where features have the keyframes")]
+    if "inflation" in bundle:  # which is not known of runs made before it was
+        sigmas = f"{bundle['inflation'] ** 0.5:.1f} times as large as tracked, by what features disagree"
+        lines.append(_line("sigmas", sigmas))
+    return lines
 
 
 def _loops(results: dict[str, Any]) -> list[str]:

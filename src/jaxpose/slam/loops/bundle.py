@@ -7,6 +7,7 @@ poses found than at those tracked, colour is beside the depth or of another time
 to be taken.
 """
 
+import itertools
 from collections.abc import Callable
 
 import numpy as np
@@ -16,7 +17,7 @@ from jaxpose.datasets.types import Frame
 from jaxpose.estimate.pose_graph import Edges
 from jaxpose.geometry import rigid
 from jaxpose.geometry.camera import Camera, project_numpy, unproject_numpy
-from jaxpose.slam.batch import own_covariances
+from jaxpose.slam.batch import inflation, own_covariances
 from jaxpose.slam.keyframes import FrameReader, overlap
 from jaxpose.slam.loops.closure import followed
 from jaxpose.slam.loops.rebuild import posed, rebuilt
@@ -72,16 +73,25 @@ def propose(
         return None
     apart = _depths_apart(lambda k: image(k).depth, (T, found.T_world_cam), state.camera)
     moved = float(np.linalg.norm(found.T_world_cam[:, :3, 3] - T[:, :3, 3], axis=1).max())
-    return Proposal(keyframes, found.T_world_cam, found.motion_covariance, moved, apart, apart < _WORSE)
+    agrees = apart < _WORSE
+    tracked = state.frames.T_world_body @ state.T_body_cam
+    larger = 1.0 if agrees else inflation(state.frames, tracked, keyframes, found.T_world_cam)
+    return Proposal(keyframes, found.T_world_cam, found.motion_covariance, moved, apart, agrees, larger)
 
 
-def adopt(state: SlamState, found: Proposal, read: FrameReader) -> SlamState:
+def adopt(
+    state: SlamState,
+    found: Proposal,
+    read: FrameReader,
+    on_frame: Callable[[int, int], None] | None = None,
+) -> SlamState:
     """The run with keyframes where they are proposed, other frames moved with them, and the map made anew.
 
     Args:
         state: a run that maps by integration. Its map is no longer usable.
         found: what is proposed for it.
         read: its frames.
+        on_frame: called with how many frames are integrated anew, and how many are to be.
 
     Returns:
         The state.
@@ -89,7 +99,14 @@ def adopt(state: SlamState, found: Proposal, read: FrameReader) -> SlamState:
     T = state.frames.T_world_body[found.keyframes] @ state.T_body_cam
     frames = followed(state.frames, found.keyframes, found.T_world_cam @ rigid.inverse(T))
     frames = frames.put(found.keyframes[1:], covariance=found.motion_covariance)
-    return rebuilt(state._replace(frames=frames), np.flatnonzero(frames.mapped), read)
+    mapped, begun = np.flatnonzero(frames.mapped), itertools.count(1)
+
+    def told(i: int) -> Frame:
+        if on_frame is not None:  # a map that has to be coarser is made once more
+            on_frame(min(next(begun), len(mapped)), len(mapped))
+        return read(i)
+
+    return rebuilt(state._replace(frames=frames), mapped, told)
 
 
 def _adjusted(
