@@ -39,6 +39,7 @@ _UNKNOWN = 1.0  # [m, rad] sigma of a motion that is not known
 _GAPS = 1, 2, 4, 8  # keyframes between two whose depth images are compared
 _GRID = 6  # [px] between compared depths
 _SAME = 0.1  # of the depth, beyond which two are of different surfaces
+_OF_MOTION = 1 / 3  # a motion has both keyframes' own errors in it, and the step of the map's
 _WORSE = 1.1  # times as far apart: what depth says, and features against it
 
 
@@ -75,7 +76,7 @@ def propose(
     moved = float(np.linalg.norm(found.T_world_cam[:, :3, 3] - T[:, :3, 3], axis=1).max())
     agrees = apart < _WORSE
     tracked = state.frames.T_world_body @ state.T_body_cam
-    larger = 1.0 if agrees else inflation(state.frames, tracked, keyframes, found.T_world_cam)
+    larger = _OF_MOTION if agrees else inflation(state.frames, tracked, keyframes, found.T_world_cam)
     return Proposal(keyframes, found.T_world_cam, found.motion_covariance, moved, apart, agrees, larger)
 
 

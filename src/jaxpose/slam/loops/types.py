@@ -43,4 +43,4 @@ class Proposal(NamedTuple):
     moved_max: float  # [m] of a keyframe
     depths_apart: float  # how many times as far apart depth images are as where they were tracked
     agrees: bool  # whether that is no contradiction: then it is to be taken
-    inflation: float  # else what covariances of tracked poses are to be multiplied by; 1 or more
+    inflation: float  # what covariances of poses by the images are to be multiplied by, once that is decided
