@@ -155,6 +155,10 @@ def test_report_states_numbers_with_their_protocol(finished):
     assert f"0 of {FRAMES} frames" in text
     bias = finished.results["calibration"]["gyro_bias"]
     assert f"IMU biases        {bias[0]:.4f}" in text
+    left = {"taken": False, "depths_apart": 1.5, "keyframes": 3, "moved_max_m": 0.1}
+    told = report(finished.folder, finished.results | {"bundle": left | {"inflation": 5.76}})
+    assert "not taken: depth images are 1.50 times" in told and "2.4 times as large as tracked" in told
+    assert "as tracked," not in report(finished.folder, finished.results | {"bundle": left})  # an earlier run
 
 
 @pytest.mark.slow

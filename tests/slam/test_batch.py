@@ -93,3 +93,4 @@ def test_covariances_are_to_explain_what_other_poses_of_keyframes_differ_by(larg
     assert found == pytest.approx(max(larger**2, 1.0), rel=0.15)
     short = inflation(frames.put(np.arange(len(t)), t=t / 1000), T, keyframes, other)  # 0.1 s in all
     assert np.isfinite(short) and short >= 1
+    assert inflation(no_frames(t), T, keyframes, other) == 1, "nothing is stated that could be too little"

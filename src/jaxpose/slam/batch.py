@@ -150,7 +150,8 @@ def inflation(
     """What covariances of tracked poses are to be multiplied by, so that they explain what others differ by.
 
     Errors that all frames of a camera have in common leave no trace in how well each fits the map. Poses by
-    other means show them: the squared distances of moves of a second, over the covariances of these.
+    other means show them: the squared distances of moves of a second, or of the longest that there is, over
+    the covariances of these.
 
     Args:
         frames: of a run.
@@ -164,6 +165,8 @@ def inflation(
     own = own_covariances(frames)
     of_map = _of_map(T_world_cam, np.nan_to_num(own))
     places = np.flatnonzero(np.isfinite(own[keyframes]).all(axis=(1, 2)))
+    if len(places) < 2:
+        return 1.0
     i, t = keyframes[places], frames.t[keyframes[places]]
     later = np.searchsorted(t, t + 1.0 - _SAME_TIME)
     first = np.flatnonzero(later < len(i)) if later[0] < len(i) else np.zeros(1, int)

@@ -150,8 +150,8 @@ def _bundle(results: dict[str, Any]) -> list[str]:
     worse = f"{bundle['depths_apart']:.2f} times as far apart"
     lines = [_line("bundle", f"not taken: depth images are {worse} where features have the keyframes")]
     if "inflation" in bundle:  # which is not known of runs made before it was
-        sigmas = f"{bundle['inflation'] ** 0.5:.1f} times as large as tracked, by what features disagree"
-        lines.append(_line("sigmas", sigmas))
+        times = f"{bundle['inflation'] ** 0.5:.1f} times as large as tracked"
+        lines.append(_line("sigmas by images", f"{times}, which is what features say against them"))
     return lines
 
 

@@ -121,7 +121,8 @@ def mesh(
     faces = np.asarray(which)[faces.astype(np.int64)]
     whole = (faces != np.roll(faces, 1, axis=1)).all(axis=1)  # no two corners have become one
     points = config.voxel * cells
-    measured = known & (before | _seen(points, keyframes, camera, config.truncation))
+    measured, asked = known.copy(), np.flatnonzero(known & ~before)
+    measured[asked] = _seen(points[asked], keyframes, camera, config.truncation)
     kept = whole & measured[faces].all(axis=1)
     used, faces = np.unique(faces[kept], return_inverse=True)
     colour = np.round(255 * np.clip(rgb[used], 0, 1)).astype(np.uint8)
