@@ -83,6 +83,25 @@ def test_trajectory(tmp_path, figures, case):
     assert ("lost" in labels) == lost.any()
 
 
+@pytest.mark.parametrize("times", [1, 100])
+def test_ellipses_hold_most_of_the_places_that_poses_may_have(tmp_path, figures, times):
+    """x of the camera is the world's, y is down, z is the world's y."""
+    covariance = np.tile(np.diag(np.square([0.01, 0.02, 0.03, 1, 1, 1]) / times**2), (N, 1, 1))
+    estimate = circle()
+    slam_plots.trajectory(tmp_path / "trajectory.png", estimate, None, lost_frames(), "a title", covariance)
+    (figure,) = figures
+    for axes, sigmas, vertical in zip(figure.axes, ([0.01, 0.03], [0.01, 0.02]), (1, 2), strict=True):
+        (rings,) = axes.collections
+        ring = np.array(rings.get_segments())
+        middle = (ring.max(axis=1) + ring.min(axis=1)) / 2
+        assert_allclose(middle[[0, -1]], estimate[[0, -1]][:, [0, vertical], 3], atol=1e-3)
+        random = np.random.default_rng(0).normal(size=(20_000, 2)) * sigmas
+        half = (ring[0].max(axis=0) - ring[0].min(axis=0)) / 2
+        assert np.mean(np.sum((random / half) ** 2, axis=1) < 1) == pytest.approx(0.9, abs=0.01)
+    labels = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
+    assert ("90% ellipse" if times == 1 else "90% ellipse, 100 times as large") in labels
+
+
 def test_trajectory_is_seen_along_the_vertical_axis_of_the_world():
     assert style.view_axes(circle()) == (0, 1, 2, 1)
     kinect = np.tile(np.eye(4), (N, 1, 1))  # a world in the axes of its first camera: up is -y
@@ -109,6 +128,19 @@ def test_errors(tmp_path, figures, lost):
         assert_allclose(line(axes, f"RMSE {rmse:.2f} {unit}").get_ydata(), rmse)
         stripes = [each for each in axes.lines if same_color(each.get_color(), style.LOST)]
         assert [each.get_xdata()[0] for each in stripes] == [t[k] for k in lost]
+
+
+def test_errors_are_seen_beside_what_was_stated(tmp_path, figures):
+    t, off = np.linspace(0, 6, N), np.full(N, 0.01)
+    covariance = np.linspace(1, 2, N)[:, None, None] * np.diag(np.square([0.01] * 3 + [0.2] * 3))
+    slam_plots.errors(tmp_path / "errors.png", t, off, 100 * off, lost_frames(), "a title", covariance)
+    (figure,) = figures
+    for axes, sigma, most in zip(figure.axes, (100 * 0.01, np.degrees(0.2)), (2.6, 3.2), strict=True):
+        (band,) = axes.collections
+        assert band.get_label() == "one sigma, as stated"
+        top = band.get_paths()[0].vertices
+        assert top[:, 1].max() == pytest.approx(sigma * np.sqrt(3 * 2), rel=1e-6)
+        assert axes.get_ylim()[1] < most  # errors stay visible
 
 
 @pytest.mark.parametrize("count", [1, 3])

@@ -1,5 +1,6 @@
 """Pictures of a run, each one PNG that appears whole or not at all; numpy in, SI units, no global state."""
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -8,7 +9,9 @@ import matplotlib
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.ticker import NullFormatter
 from scipy.ndimage import uniform_filter1d
 
@@ -23,9 +26,13 @@ from jaxpose.plots.style import (
     gapped,
     paths,
     save,
+    view_axes,
 )
 
 _VIEW_TITLES = ("input colour", "rendered colour", "input depth", "rendered depth", "rendered - input depth")
+_ELLIPSES = 12  # of a trajectory
+_CHI2_90 = 4.605  # of chi-squared of two numbers
+_LARGEST = 0.05  # of the trajectory's extent, that ellipses are enlarged to
 _MODES = {
     "none": "#8a8a8a",
     "loose": "#5aa5d6",
@@ -51,10 +58,12 @@ def trajectory(
     reference: Float[np.ndarray, "n 4 4"] | None,
     lost: Bool[np.ndarray, " n"],
     title: str,
+    covariance: Float[np.ndarray, "n 6 6"] | None = None,
 ) -> None:
     """Camera centres from above and from the side, coloured by their distance to the reference, if any.
 
-    The view from above is along the world axis nearest to the cameras' mean up.
+    The view from above is along the world axis nearest to the cameras' mean up. Ellipses that hold 90% of the
+    places that some poses may have are drawn as many times enlarged as the legend says.
 
     Args:
         path: PNG to write.
@@ -62,6 +71,7 @@ def trajectory(
         reference: ground truth; None: there is none.
         lost: frames that tracking lost.
         title: of the figure.
+        covariance: of the poses, over increments [m, rad] on the right; None: not known.
     """
     off = None if reference is None else 100 * _distances(estimate, reference)
     with matplotlib.rc_context(STYLE):
@@ -70,8 +80,40 @@ def trajectory(
         shade = paths(views, estimate, reference, off, lost)
         if shade is not None:
             figure.colorbar(shade, ax=views, label="distance to the ground truth [cm]", shrink=0.9, pad=0.015)
+        if covariance is not None:
+            _ellipses(views, estimate, reference, covariance)
         figure.suptitle(title)
         save(figure, path)
+
+
+def _ellipses(
+    views: Sequence[Axes],
+    estimate: Float[np.ndarray, "n 4 4"],
+    reference: Float[np.ndarray, "n 4 4"] | None,
+    covariance: Float[np.ndarray, "n 6 6"],
+) -> None:
+    """Ellipses of 90% around some camera centres in the views that `paths` has drawn."""
+    shown = estimate if reference is None else reference[np.isfinite(reference).all(axis=(1, 2))]
+    across, along, up, _ = view_axes(shown)
+    some = np.linspace(0, len(estimate) - 1, min(_ELLIPSES, len(estimate))).round().astype(int)
+    R = estimate[some, :3, :3]
+    of_place = R @ covariance[some, :3, :3] @ np.swapaxes(R, 1, 2)
+    largest = np.sqrt(_CHI2_90 * max(np.linalg.eigvalsh(of_place)[:, -1].max(), 1e-24))
+    extent = np.ptp(estimate[:, :3, 3], axis=0).max()
+    times = 10 ** max(math.floor(math.log10(max(_LARGEST * extent / largest, 1.0))), 0)
+    turn = np.linspace(0, 2 * np.pi, 49)
+    circle = times * math.sqrt(_CHI2_90) * np.stack([np.cos(turn), np.sin(turn)])
+    for axes, ab in zip(views, ([across, along], [across, up]), strict=True):
+        variance, axis = np.linalg.eigh(of_place[np.ix_(range(len(some)), ab, ab)])
+        rings = estimate[some][:, ab, 3, None] + axis @ (np.sqrt(variance)[..., None] * circle)
+        lines = LineCollection(list(np.swapaxes(rings, 1, 2)), colors="black", linewidths=0.8, zorder=4)
+        axes.add_collection(lines)
+        axes.autoscale_view()
+    label = "90% ellipse" + f", {times} times as large" * (times > 1)
+    key = Line2D([], [], color="black", marker="o", mfc="none", ls="", ms=7, mew=0.8, label=label)
+    legend = views[0].get_legend()
+    assert legend is not None
+    views[0].legend(handles=[*legend.legend_handles, key], loc="best")
 
 
 def errors(
@@ -81,8 +123,9 @@ def errors(
     rotation_deg: Float[np.ndarray, " n"],
     lost: Bool[np.ndarray, " n"],
     title: str,
+    covariance: Float[np.ndarray, "n 6 6"] | None = None,
 ) -> None:
-    """Errors of every frame over time, their root mean square, and the frames that tracking lost.
+    """Errors of every frame over time, beside what they were said to be, and the frames that tracking lost.
 
     Args:
         path: PNG to write.
@@ -91,20 +134,30 @@ def errors(
         rotation_deg: errors [deg], NaN where there is no ground truth.
         lost: frames that tracking lost.
         title: of the figure.
+        covariance: of the poses, over increments [m, rad] on the right; None: not known.
     """
+    sigmas = [None, None]
+    if covariance is not None:
+        squares = np.diagonal(covariance, axis1=1, axis2=2).reshape(-1, 2, 3).sum(axis=-1)
+        sigmas = [100 * np.sqrt(squares[:, 0]), np.degrees(np.sqrt(squares[:, 1]))]
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(10, 5), dpi=DPI, layout="constrained")
         rows: list[Axes] = list(figure.subplots(2, 1, sharex=True))
-        for axes, values, unit, name in zip(
-            rows, (100 * translation_m, rotation_deg), ("cm", "deg"), ("translation", "rotation"), strict=True
+        of_both = zip((100 * translation_m, rotation_deg), sigmas, strict=True)
+        for axes, (values, sigma), unit, name in zip(
+            rows, of_both, ("cm", "deg"), ("translation", "rotation"), strict=True
         ):
             rmse = float(np.sqrt(np.nanmean(values**2)))
             axes.plot(t, values, "-o", color=ESTIMATE, lw=1.2, ms=2.5)
             axes.axhline(rmse, color=ESTIMATE, lw=0.9, ls="--", label=f"RMSE {rmse:.2f} {unit}")
             _mark(axes, t, lost)
+            top = 1.05 * np.nanmax(values)
+            if sigma is not None:
+                axes.fill_between(t, sigma, color=SENSOR, alpha=0.3, lw=0, label="one sigma, as stated")
+                top = max(top, min(1.05 * float(np.nanmax(sigma)), 3 * top))
             axes.set(ylabel=f"{name} error [{unit}]")
-            axes.set_ylim(bottom=0)
-            axes.legend(loc="upper left", ncols=2)
+            axes.set_ylim(0, top if top > 0 else None)
+            axes.legend(loc="upper left", ncols=3)
         rows[-1].set(xlabel="time [s]", xlim=(t[0], t[-1]))
         figure.suptitle(title)
         save(figure, path)

@@ -26,6 +26,7 @@ from jaxpose.experiments.slam.map_rendering import Renderer, renderer, views
 from jaxpose.experiments.slam.options import Options
 from jaxpose.experiments.slam.source import Source
 from jaxpose.fields import save, shifted
+from jaxpose.fields.numpy_evaluator import load_covariance
 from jaxpose.files import atomic, trajectories
 from jaxpose.files.camera_json import write_camera
 from jaxpose.files.ply import write_ply
@@ -169,6 +170,15 @@ def _write_mesh(file: Path, recording: Recording, result: SlamResult) -> tuple[s
     return ()
 
 
+def _covariance(recording: Recording, result: SlamResult) -> Float[np.ndarray, "n 6 6"] | None:
+    """How sure the poses of the frames are, where that is known."""
+    known = result.covariances
+    if known is None:
+        return None
+    at = load_covariance({"covariance_times": known.t, "covariance": known.pose})
+    return at(np.clip(recording.t - recording.t[0], known.t[0], known.t[-1]))
+
+
 def _draw(
     folder: Path,
     name: str,
@@ -180,13 +190,21 @@ def _draw(
     """The pictures of a run, poses aligned as their errors are."""
     errors, motion, freed = measured
     name = f"{name}, {len(recording.t)} frames"
+    covariance = _covariance(recording, result)
     if errors is None:
         title = f"{name}: no ground truth to compare with"
-        slam_plots.trajectory(folder / "trajectory.png", result.T_world_cam, None, result.frames.lost, title)
+        slam_plots.trajectory(
+            folder / "trajectory.png", result.T_world_cam, None, result.frames.lost, title, covariance
+        )
     else:
         ate = f"{name}: ATE-RMSE {100 * errors.numbers['ate_rmse_m']:.2f} cm after SE(3) alignment"
         slam_plots.trajectory(
-            folder / "trajectory.png", errors.aligned, recording.T_world_cam, result.frames.lost, ate
+            folder / "trajectory.png",
+            errors.aligned,
+            recording.T_world_cam,
+            result.frames.lost,
+            ate,
+            covariance,
         )
         slam_plots.errors(
             folder / "errors.png",
@@ -195,6 +213,7 @@ def _draw(
             errors.rotation_deg,
             result.frames.lost,
             ate,
+            covariance,
         )
     slam_plots.renders(
         folder / "renders.png",
