@@ -49,6 +49,11 @@ def test_no_depth_at_all_leaves_the_motions():
     _, tracks, depth, start, motions = problem(random)
     found = adjust_measured(tracks, 0 * depth, start, motions)
     np.testing.assert_allclose(found.T_world_cam, start, atol=1e-6)
+    np.testing.assert_allclose(found.covariance[1], found.motion_covariance[0], atol=1e-12)
+    # A lever: the first motion's error of rotation moves the third pose, about where the second was.
+    across = rigid.inverse(rigid.inverse(start[1]) @ start[2])
+    both = rigid.carried(across[None], found.motion_covariance[:1])[0] + found.motion_covariance[1]
+    np.testing.assert_allclose(found.covariance[2], both, atol=1e-12)
 
 
 def test_against_scipy():
@@ -79,16 +84,19 @@ def test_against_scipy():
 
 @pytest.mark.parametrize("told", [0.1, 1.0, 10.0])
 def test_motions_count_as_they_agree_and_not_as_they_say(told):
-    """Whatever factor their information is told with; and the errors of motions are as large as stated."""
+    """Whatever factor their information is told with; errors of motions and poses are as large as stated."""
     random = np.random.default_rng(3)
-    squares = []
+    squares, of_poses = [], []
     for _ in range(6):
         T, tracks, depth, start, motions = problem(random, moved=0.002)
         motions = motions._replace(information=told * motions.information)
-        found, covariance = adjust_measured(tracks, depth, start, motions)
+        found, known, covariance = adjust_measured(tracks, depth, start, motions)
+        assert not known[0].any()
+        off = rigid.log(rigid.inverse(T[1:]) @ found[1:])
+        of_poses.append(np.einsum("ni,nij,nj->n", off, np.linalg.inv(known[1:]), off))
         off = rigid.log(rigid.inverse(rigid.inverse(T[:-1]) @ T[1:]) @ rigid.inverse(found[:-1]) @ found[1:])
         squares.append(np.einsum("ni,nij,nj->n", off, np.linalg.inv(covariance), off))
-    assert 4 < np.mean(squares) < 9  # 6 numbers each
+    assert 4 < np.mean(squares) < 9 and 3 < np.mean(of_poses) < 10  # 6 numbers each
 
 
 def test_what_does_not_fit_is_refused():

@@ -16,12 +16,14 @@ from jaxpose.fields import Covariances, Params, PoseField, bspline, fit
 from jaxpose.geometry import rigid
 from jaxpose.imu import Imu
 from jaxpose.slam.config import SlamConfig
+from jaxpose.slam.loops.types import Proposal
 from jaxpose.slam.types import Frames, SlamState, TrackingStatus
 
 _FEWEST = 4  # poses that an estimate can be made of
 _UNKNOWN = 1.0  # [m, rad] sigma of a pose that ends the run and is in doubt
 SEEN_AGAIN_S = 4.0  # in which the map's error is forgotten: experiments/estimate.md
 _RESOLVED = 1e-5  # [m, rad] that poses in float32 resolve
+_OF_MOTION = 1 / 3  # a motion between keyframes has both's own errors in it, and the step of the map's
 _SAME_TIME = 1e-6  # [s]
 _MEDIAN_SQUARE = 5.348  # of chi-squared of six numbers
 _ALIKE = 4  # registered frames to either side whose covariances are averaged: that of one is of 16 numbers
@@ -39,7 +41,7 @@ class FinalTrajectory(NamedTuple):
     covariances: Covariances | None  # of it; None where a PoseNet tracked, and of too few registered frames
 
 
-def final_trajectory(state: SlamState, imu: Imu | None, inflation: float = 1.0) -> FinalTrajectory:
+def final_trajectory(state: SlamState, imu: Imu | None, adjusted: Proposal | None = None) -> FinalTrajectory:
     """The most likely trajectory where readings tell more than poses, else a field through all poses.
 
     A field through poses is a B-spline with a knot a frame: a PoseNet over the same 12 s of the default room
@@ -48,13 +50,13 @@ def final_trajectory(state: SlamState, imu: Imu | None, inflation: float = 1.0) 
     Args:
         state: a run of at least two frames.
         imu: all readings, on the clock of the frames.
-        inflation: what covariances by the images are to be multiplied by.
+        adjusted: what features said of the keyframes; None: nothing.
 
     Returns:
         The trajectory.
     """
     frames = state.frames
-    posterior, by_images = estimate_trajectory(state, imu, inflation)
+    posterior, by_images = estimate_trajectory(state, imu, adjusted)
     tracked, t = frames.T_world_body @ state.T_body_cam, frames.t - frames.t[0]
     if posterior is None:
         intervals = max(round(t[-1] / float(np.median(np.diff(t)))), 1)
@@ -70,7 +72,7 @@ def final_trajectory(state: SlamState, imu: Imu | None, inflation: float = 1.0) 
 
 
 def estimate_trajectory(
-    state: SlamState, imu: Imu | None, inflation: float = 1.0
+    state: SlamState, imu: Imu | None, adjusted: Proposal | None = None
 ) -> tuple[Posterior | None, Covariances | None]:
     """The trajectory that poses and readings together make most likely, on the clock of the first frame.
 
@@ -81,7 +83,7 @@ def estimate_trajectory(
     Args:
         state: a run.
         imu: all readings, on the clock of the frames.
-        inflation: what covariances by the images are to be multiplied by.
+        adjusted: what features said of the keyframes; None: nothing.
 
     Returns:
         The posterior: None without readings that the run uses, with too few registered frames, and where a
@@ -95,8 +97,14 @@ def estimate_trajectory(
         return None, None
     own, t = own[kept], frames.t[kept] - frames.t[0]
     T_world_cam = frames.T_world_body[kept] @ state.T_body_cam
+    by_images, of_map = own, None
+    if adjusted is not None:
+        by_images = adjusted.inflation * own
+        if adjusted.agrees:
+            by_images = np.where(frames.keyframe[kept, None, None], _OF_MOTION * own, own)
+            of_map = _of_keyframes(frames.t, adjusted)[kept]
     if imu is None or not config.uses_gyroscope:
-        return None, tracked_covariances(t, T_world_cam, inflation * own)
+        return None, tracked_covariances(t, T_world_cam, by_images, of_map)
     use = {"accelerometer": ("accelerometer",), "combined": ("gyroscope", "accelerometer")}
     estimated = partial(
         smooth,
@@ -115,7 +123,7 @@ def estimate_trajectory(
         posterior = estimated(drift=own, drift_s=SEEN_AGAIN_S)
         if max(posterior.noise.position, posterior.noise.rotation) < 1:
             return posterior, None
-    return estimated(), tracked_covariances(t, T_world_cam, inflation * own)
+    return estimated(), tracked_covariances(t, T_world_cam, by_images, of_map)
 
 
 def estimated_beside_poses(config: SlamConfig) -> tuple[str, ...]:
@@ -188,8 +196,19 @@ def _of_map(
     return np.concatenate([np.zeros((1, 6, 6)), added])
 
 
+def _of_keyframes(t: Float[np.ndarray, " n"], adjusted: Proposal) -> Float[np.ndarray, "n 6 6"]:
+    """How far off keyframes that were adjusted together are, and frames between, on the left of poses."""
+    known, at = rigid.carried(adjusted.T_world_cam, adjusted.covariance), t[adjusted.keyframes]
+    j = np.clip(np.searchsorted(at, t, side="right"), 1, len(at) - 1)
+    share = np.clip((t - at[j - 1]) / (at[j] - at[j - 1]), 0, 1)[:, None, None]
+    return (1 - share) * known[j - 1] + share * known[j]
+
+
 def tracked_covariances(
-    t: Float[np.ndarray, " n"], T_world_cam: Float[np.ndarray, "n 4 4"], own: Float[np.ndarray, "n 6 6"]
+    t: Float[np.ndarray, " n"],
+    T_world_cam: Float[np.ndarray, "n 4 4"],
+    own: Float[np.ndarray, "n 6 6"],
+    of_map: Float[np.ndarray, "n 6 6"] | None = None,
 ) -> Covariances:
     """How sure a trajectory through tracked poses is, at them and between.
 
@@ -201,11 +220,14 @@ def tracked_covariances(
         t: times of the poses [s].
         T_world_cam: the poses.
         own: covariance of each beside the map.
+        of_map: covariance of the map where each was taken, over increments on the left of the poses; None:
+            it walks by steps as large as `own`, as it does for moves of one second.
 
     Returns:
         Covariances of poses, and of moves of one second.
     """
     added = _of_map(T_world_cam, own)
+    of_poses = added if of_map is None else of_map
     step, dt = rigid.log(rigid.inverse(T_world_cam[:-1]) @ T_world_cam[1:]), np.diff(t)
     change = (step[1:] / dt[1:, None] - step[:-1] / dt[:-1, None]) / ((dt[1:] + dt[:-1]) / 2)[:, None]
     density = (
@@ -218,11 +240,12 @@ def tracked_covariances(
         T = T_world_cam[i] @ rigid.exp(u * step[i])
         between = lambda x: (1 - u[..., None]) * x[i] + u[..., None] * x[i + 1]
         bridged = density * (dt[i, None] ** 3 * (u * (1 - u)) ** 2 / 6)
-        return T, between(added), between(own) + bridged[:, :, None] * np.eye(6)
+        alone = between(own) + bridged[:, :, None] * np.eye(6)
+        return T, alone, between(added), between(of_poses)
 
     times, early = table_times((float(t[0]), float(t[-1])))
-    T, shared, alone = at(times)
-    (T_a, shared_a, alone_a), (T_b, shared_b, alone_b) = at(early), at(early + 1.0)
+    T, alone, _, shared = at(times)
+    (T_a, alone_a, shared_a, _), (T_b, alone_b, shared_b, _) = at(early), at(early + 1.0)
     T_b_world = rigid.inverse(T_b)
     by_first = rigid.carried(T_b_world, shared_b - shared_a) + rigid.carried(T_b_world @ T_a, alone_a)
     return Covariances(times, rigid.carried(rigid.inverse(T), shared) + alone, by_first + alone_b)

@@ -152,7 +152,7 @@ def run(
             bundle = propose(state, recording.read, on_refined)
             if bundle is not None and bundle.agrees:
                 state = adopt(state, bundle, recording.read, on_refined)
-    found = _final(state, recording.imu, 1.0 if bundle is None else bundle.inflation)
+    found = _final(state, recording.imu, bundle)
     if found.posterior is not None and not state.passes and told_wrongly(state, found.posterior):
         return run(recording, config, on_frame, begun_again(state, found.posterior), on_refined)
     return _summed_up(state, recording.read, found, bundle)
@@ -262,11 +262,11 @@ def _refit(camera: Camera, config: SlamConfig):
     return make_refit(*framed.parts, angle_of_view(camera)[0])
 
 
-def _final(state: SlamState, imu: Imu | None, inflation: float = 1.0) -> FinalTrajectory:
+def _final(state: SlamState, imu: Imu | None, bundle: Proposal | None = None) -> FinalTrajectory:
     """One continuous trajectory, by all readings or else through all poses."""
     if (count := state.frames.count) < 2:
         raise DataError(f"SLAM: expected at least 2 frames, got {count}")
-    return final_trajectory(state, imu, inflation)
+    return final_trajectory(state, imu, bundle)
 
 
 def _summed_up(

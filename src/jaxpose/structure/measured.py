@@ -45,10 +45,14 @@ class _Observations(NamedTuple):
 
 
 class Adjusted(NamedTuple):
-    """Camera-to-world poses, and how sure the motion from each to the next is."""
+    """Camera-to-world poses, and how sure they and the motion from each to the next are.
+
+    Covariances are of right increments [m, rad], of the later pose for a motion; the first pose is as it is.
+    """
 
     T_world_cam: Float[np.ndarray, "n 4 4"]
-    motion_covariance: Float[np.ndarray, "k 6 6"]  # over right increments [m, rad] of the later pose
+    covariance: Float[np.ndarray, "n 6 6"]
+    motion_covariance: Float[np.ndarray, "k 6 6"]
 
 
 def adjust_measured(
@@ -63,7 +67,7 @@ def adjust_measured(
         motions: From each view to the next, with information up to a factor.
 
     Returns:
-        Camera-to-world poses [m], and covariances of the motions by the spread of all errors.
+        Camera-to-world poses [m], and covariances of poses and motions by the spread of all errors.
 
     Raises:
         ValueError: For depths or poses of another number or shape, or not finite.
@@ -72,7 +76,10 @@ def adjust_measured(
     check_finite(T_start=T_start, depth=depth)
     seen, generator = _measured(tracks, depth), np.random.default_rng(0)
     if not len(seen.view):
-        return Adjusted(np.array(T_start, np.float64), np.linalg.inv(motions.information))
+        T, of_motions = np.array(T_start, np.float64), np.linalg.inv(motions.information)
+        by_world = np.cumsum(rigid.carried(T[1:], of_motions), axis=0)
+        summed = np.concatenate([np.zeros((1, 6, 6)), rigid.carried(rigid.inverse(T[1:]), by_world)])
+        return Adjusted(T, summed, of_motions)
     T, points = np.array(T_start, np.float64), _start_points(seen, T_start)
     weight = np.ones(len(motions.a))
     for index in range(_STEPS):
@@ -88,7 +95,7 @@ def adjust_measured(
         if index >= _FIRST:
             weight[:] = _factor(squared_distances(T, motions), tied[6:, 6:], solver, generator)
     T[:, :3, :3] = rigid.nearest_rotation(T[:, :3, :3])
-    return Adjusted(T, _motion_covariances(T, solver))
+    return Adjusted(T, *_covariances(T, solver))
 
 
 def _factor(chi2: Float[np.ndarray, " m"], tied: csc_matrix, solver: SuperLU, generator: np.random.Generator):
@@ -99,21 +106,22 @@ def _factor(chi2: Float[np.ndarray, " m"], tied: csc_matrix, solver: SuperLU, ge
     return left / max(float(np.minimum(chi2, _LARGE * np.median(chi2)).sum()), 1e-9)
 
 
-def _motion_covariances(T: Float[np.ndarray, "n 4 4"], solver: SuperLU) -> Float[np.ndarray, "k 6 6"]:
-    """Of the motion from each pose to the next, the first one being fixed."""
+def _covariances(
+    T: Float[np.ndarray, "n 4 4"], solver: SuperLU
+) -> tuple[Float[np.ndarray, "n 6 6"], Float[np.ndarray, "k 6 6"]]:
+    """Of each pose and of the motion from each to the next, the first pose being fixed."""
     size = 6 * (len(T) - 1)
     to_later = -rigid.adjoint(rigid.inverse(T[1:]) @ T[:-1])
-    found = np.zeros((len(T) - 1, 6, 6))
-    before = np.zeros((6, 6))
+    of_poses, of_motions = np.zeros((len(T), 6, 6)), np.zeros((len(T) - 1, 6, 6))
     for k, by_before in enumerate(to_later):
         unit = np.zeros((size, 6))
         unit[6 * k : 6 * k + 6] = np.eye(6)
         column = np.concatenate([np.zeros((6, 6)), solver.solve(unit)])  # of the first pose: zeros
         across, own = column[6 * k : 6 * k + 6], column[6 * k + 6 : 6 * k + 12]
         both = by_before @ across
-        found[k] = by_before @ before @ by_before.T + own + both + both.T
-        before = own
-    return found
+        of_motions[k] = by_before @ of_poses[k] @ by_before.T + own + both + both.T
+        of_poses[k + 1] = own
+    return of_poses, of_motions
 
 
 def _measured(tracks: Tracks, depth: Float[np.ndarray, " o"]) -> _Observations:

@@ -39,7 +39,6 @@ _UNKNOWN = 1.0  # [m, rad] sigma of a motion that is not known
 _GAPS = 1, 2, 4, 8  # keyframes between two whose depth images are compared
 _GRID = 6  # [px] between compared depths
 _SAME = 0.1  # of the depth, beyond which two are of different surfaces
-_OF_MOTION = 1 / 3  # a motion has both keyframes' own errors in it, and the step of the map's
 _WORSE = 1.1  # times as far apart: what depth says, and features against it
 
 
@@ -76,8 +75,17 @@ def propose(
     moved = float(np.linalg.norm(found.T_world_cam[:, :3, 3] - T[:, :3, 3], axis=1).max())
     agrees = apart < _WORSE
     tracked = state.frames.T_world_body @ state.T_body_cam
-    larger = _OF_MOTION if agrees else inflation(state.frames, tracked, keyframes, found.T_world_cam)
-    return Proposal(keyframes, found.T_world_cam, found.motion_covariance, moved, apart, agrees, larger)
+    larger = 1.0 if agrees else inflation(state.frames, tracked, keyframes, found.T_world_cam)
+    return Proposal(
+        keyframes,
+        found.T_world_cam,
+        found.covariance,
+        found.motion_covariance,
+        moved_max=moved,
+        depths_apart=apart,
+        agrees=agrees,
+        inflation=larger,
+    )
 
 
 def adopt(
@@ -134,7 +142,9 @@ def _adjusted(
     tracks = Tracks(view, point, xy, len(T), focal, placed.found)
     found = adjust_measured(tracks, of([each.depth for each in features]), T, _motions(state, keyframes, T))
     together = max(len(view) / len(T) / _INDEPENDENT, 1.0)
-    return found._replace(motion_covariance=together * found.motion_covariance)
+    return found._replace(
+        covariance=together * found.covariance, motion_covariance=together * found.motion_covariance
+    )
 
 
 def _pairs(features: tuple[Features, ...], T: Float[np.ndarray, "k 4 4"], camera: Camera):

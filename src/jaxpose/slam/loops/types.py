@@ -39,8 +39,9 @@ class Proposal(NamedTuple):
 
     keyframes: Int[np.ndarray, " k"]  # which frames
     T_world_cam: Float[np.ndarray, "k 4 4"]
+    covariance: Float[np.ndarray, "k 6 6"]  # of these poses, over right increments; zero of the first
     motion_covariance: Float[np.ndarray, "j 6 6"]  # from each to the next, right increments of the later one
     moved_max: float  # [m] of a keyframe
     depths_apart: float  # how many times as far apart depth images are as where they were tracked
     agrees: bool  # whether that is no contradiction: then it is to be taken
-    inflation: float  # what covariances of poses by the images are to be multiplied by, once that is decided
+    inflation: float  # else what covariances of tracked poses are to be multiplied by; 1 or more
