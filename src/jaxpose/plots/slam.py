@@ -1,6 +1,5 @@
 """Pictures of a run, each one PNG that appears whole or not at all; numpy in, SI units, no global state."""
 
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -9,9 +8,7 @@ import matplotlib
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.ticker import NullFormatter
 from scipy.ndimage import uniform_filter1d
 
@@ -26,13 +23,9 @@ from jaxpose.plots.style import (
     gapped,
     paths,
     save,
-    view_axes,
 )
 
 _VIEW_TITLES = ("input colour", "rendered colour", "input depth", "rendered depth", "rendered - input depth")
-_ELLIPSES = 12  # of a trajectory
-_CHI2_90 = 4.605  # of chi-squared of two numbers
-_LARGEST = 0.05  # of the trajectory's extent, that ellipses are enlarged to
 _MODES = {
     "none": "#8a8a8a",
     "loose": "#5aa5d6",
@@ -77,43 +70,11 @@ def trajectory(
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(11, 5.2), dpi=DPI, layout="constrained")
         views: list[Axes] = list(figure.subplots(1, 2))
-        shade = paths(views, estimate, reference, off, lost)
+        shade = paths(views, estimate, reference, off, lost, covariance)
         if shade is not None:
             figure.colorbar(shade, ax=views, label="distance to the ground truth [cm]", shrink=0.9, pad=0.015)
-        if covariance is not None:
-            _ellipses(views, estimate, reference, covariance)
         figure.suptitle(title)
         save(figure, path)
-
-
-def _ellipses(
-    views: Sequence[Axes],
-    estimate: Float[np.ndarray, "n 4 4"],
-    reference: Float[np.ndarray, "n 4 4"] | None,
-    covariance: Float[np.ndarray, "n 6 6"],
-) -> None:
-    """Ellipses of 90% around some camera centres in the views that `paths` has drawn."""
-    shown = estimate if reference is None else reference[np.isfinite(reference).all(axis=(1, 2))]
-    across, along, up, _ = view_axes(shown)
-    some = np.linspace(0, len(estimate) - 1, min(_ELLIPSES, len(estimate))).round().astype(int)
-    R = estimate[some, :3, :3]
-    of_place = R @ covariance[some, :3, :3] @ np.swapaxes(R, 1, 2)
-    largest = np.sqrt(_CHI2_90 * max(np.linalg.eigvalsh(of_place)[:, -1].max(), 1e-24))
-    extent = np.ptp(estimate[:, :3, 3], axis=0).max()
-    times = 10 ** max(math.floor(math.log10(max(_LARGEST * extent / largest, 1.0))), 0)
-    turn = np.linspace(0, 2 * np.pi, 49)
-    circle = times * math.sqrt(_CHI2_90) * np.stack([np.cos(turn), np.sin(turn)])
-    for axes, ab in zip(views, ([across, along], [across, up]), strict=True):
-        variance, axis = np.linalg.eigh(of_place[np.ix_(range(len(some)), ab, ab)])
-        rings = estimate[some][:, ab, 3, None] + axis @ (np.sqrt(variance)[..., None] * circle)
-        lines = LineCollection(list(np.swapaxes(rings, 1, 2)), colors="black", linewidths=0.8, zorder=4)
-        axes.add_collection(lines)
-        axes.autoscale_view()
-    label = "90% ellipse" + f", {times} times as large" * (times > 1)
-    key = Line2D([], [], color="black", marker="o", mfc="none", ls="", ms=7, mew=0.8, label=label)
-    legend = views[0].get_legend()
-    assert legend is not None
-    views[0].legend(handles=[*legend.legend_handles, key], loc="best")
 
 
 def errors(

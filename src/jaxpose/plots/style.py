@@ -1,5 +1,6 @@
 """The style that all pictures share, and what several of them draw."""
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,9 @@ STYLE: Any = {
     "legend.frameon": False,
 }
 AXES = "xyz"
+_ELLIPSES = 12  # of a trajectory
+_CHI2_90 = 4.605  # of chi-squared of two numbers
+_LARGEST, _LEAST = 0.05, 1e-12  # of the trajectory's extent, that ellipses are enlarged to; [m] of one
 
 
 def save(figure: Figure, path: Path | str) -> None:
@@ -64,6 +68,7 @@ def paths(
     reference: Float[np.ndarray, "n 4 4"] | None,
     distances: Float[np.ndarray, " n"] | None,
     lost: Bool[np.ndarray, " n"],
+    covariance: Float[np.ndarray, "n 6 6"] | None = None,
 ) -> LineCollection | None:
     """Draw camera centres from above and from the side.
 
@@ -73,6 +78,8 @@ def paths(
         reference: ground truth, NaN where there is none; None: not drawn.
         distances: what colours the estimate; None: nothing does.
         lost: poses that are marked.
+        covariance: of the poses, over increments [m, rad] on the right; ellipses around some of them hold
+            90% of the places that it allows; None: none are drawn.
 
     Returns:
         What a colour bar is made from; None without distances.
@@ -80,7 +87,7 @@ def paths(
     ground_truth = estimate if reference is None else reference
     usable = np.isfinite(ground_truth).all(axis=(1, 2))
     across, along, up, sign = view_axes(ground_truth[usable])
-    shade = None
+    shade, keys = None, list[Line2D]()
     for axes, (a, b), name in zip(
         views, ((across, along), (across, up)), ("from above", "from the side"), strict=True
     ):
@@ -94,12 +101,36 @@ def paths(
         axes.plot(*centres[0], "o", color="black", ms=5, zorder=4)
         axes.plot(*centres[lost].T, "x", color=LOST, ms=6, mew=1.6, zorder=5)
         axes.set(title=name, xlabel=f"{AXES[a]} [m]", ylabel=f"{AXES[b]} [m]")
+        if covariance is not None:
+            keys = _ellipses(axes, estimate, covariance, [a, b])
         axes.set_aspect("equal", adjustable="datalim")
         axes.autoscale_view()
     if sign < 0:
         views[1].invert_yaxis()
-    views[0].legend(handles=trajectory_legend(reference is not None, bool(lost.any())), loc="best")
+    handles = trajectory_legend(reference is not None, bool(lost.any())) + keys
+    views[0].legend(handles=handles, loc="best")
     return shade
+
+
+def _ellipses(
+    axes: Axes, estimate: Float[np.ndarray, "n 4 4"], covariance: Float[np.ndarray, "n 6 6"], ab: list[int]
+) -> list[Line2D]:
+    """Draw ellipses of 90% along two world axes, larger by a power of ten that the legend's entry names."""
+    some = np.linspace(0, len(estimate) - 1, min(_ELLIPSES, len(estimate))).round().astype(int)
+    R = estimate[some, :3, :3]
+    of_place = _CHI2_90 * R @ covariance[some, :3, :3] @ np.swapaxes(R, 1, 2)
+    largest = math.sqrt(max(np.linalg.eigvalsh(of_place).max(), _LEAST**2))
+    extent = np.ptp(estimate[:, :3, 3], axis=0).max()
+    times = 10 ** math.floor(math.log10(max(_LARGEST * extent / largest, 1.0)))
+    turn = np.linspace(0, 2 * np.pi, 49)
+    squares, axis = np.linalg.eigh(of_place[np.ix_(range(len(some)), ab, ab)])
+    rings = axis @ (times * np.sqrt(squares)[..., None] * np.stack([np.cos(turn), np.sin(turn)]))
+    rings = estimate[some][:, ab, 3] + np.moveaxis(rings, -1, 0)
+    axes.add_collection(
+        LineCollection(list(np.moveaxis(rings, 0, 1)), colors="black", linewidths=0.8, zorder=4)
+    )
+    label = "90% ellipse" + f", {times} times as large" * (times > 1)
+    return [Line2D([], [], color="black", marker="o", mfc="none", ls="", ms=7, mew=0.8, label=label)]
 
 
 def shaded_path(

@@ -78,7 +78,7 @@ def compile_search(state: SlamState, image: Image) -> None:
     """Begin to compile the search for a camera in doubt, so that the first doubt does not wait for it.
 
     Args:
-        state: after its first frame was mapped.
+        state: with room in its map for the first frame.
         image: of that frame.
     """
     assert state.map is not None
@@ -89,8 +89,8 @@ def compile_growth(state: SlamState, used: int, image: Image, expected: MotionPr
     """Begin to compile what a larger pool of blocks needs, once the present one is three quarters full.
 
     Args:
-        state: after a frame was mapped.
-        used: rows of the pool that were in use before it.
+        state: with room in its map for a frame.
+        used: rows of the pool that were in use before there was.
         image: of that frame.
         expected: of its motion.
     """

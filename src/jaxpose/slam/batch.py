@@ -180,10 +180,10 @@ def inflation(
     first = np.flatnonzero(later < len(i)) if later[0] < len(i) else np.zeros(1, int)
     last = np.minimum(later[first], len(i) - 1)
     a, b = i[first], i[last]
-    T_b, moved = rigid.inverse(T_world_cam[b]), rigid.inverse(T_world_cam[a]) @ T_world_cam[b]
+    moved = rigid.inverse(T_world_cam[a]) @ T_world_cam[b]
     otherwise = rigid.inverse(T_other[places[first]]) @ T_other[places[last]]
     off = rigid.log(rigid.inverse(moved) @ otherwise)
-    known = rigid.carried(T_b, of_map[b] - of_map[a]) + rigid.carried(rigid.inverse(moved), own[a]) + own[b]
+    known = _of_move((T_world_cam[a], T_world_cam[b]), of_map[b] - of_map[a], (own[a], own[b]))
     squares = np.einsum("ni,ni->n", off, np.linalg.solve(known, off[..., None])[..., 0])
     return max(float(np.median(squares)) / _MEDIAN_SQUARE, 1.0)
 
@@ -194,6 +194,16 @@ def _of_map(
     """The walk of the map's error since the first pose, over increments on the left of poses."""
     added = np.cumsum(rigid.carried(T_world_cam, own)[1:], axis=0)
     return np.concatenate([np.zeros((1, 6, 6)), added])
+
+
+def _of_move(
+    T: tuple[Float[np.ndarray, "n 4 4"], Float[np.ndarray, "n 4 4"]],
+    walked: Float[np.ndarray, "n 6 6"],
+    own: tuple[Float[np.ndarray, "n 6 6"], Float[np.ndarray, "n 6 6"]],
+) -> Float[np.ndarray, "n 6 6"]:
+    """Covariances of moves by those of both poses beside the map, and by how far that has walked between."""
+    T_b_world = rigid.inverse(T[1])
+    return rigid.carried(T_b_world, walked) + rigid.carried(T_b_world @ T[0], own[0]) + own[1]
 
 
 def _of_keyframes(t: Float[np.ndarray, " n"], adjusted: Proposal) -> Float[np.ndarray, "n 6 6"]:
@@ -246,6 +256,5 @@ def tracked_covariances(
     times, early = table_times((float(t[0]), float(t[-1])))
     T, alone, _, shared = at(times)
     (T_a, alone_a, shared_a, _), (T_b, alone_b, shared_b, _) = at(early), at(early + 1.0)
-    T_b_world = rigid.inverse(T_b)
-    by_first = rigid.carried(T_b_world, shared_b - shared_a) + rigid.carried(T_b_world @ T_a, alone_a)
-    return Covariances(times, rigid.carried(rigid.inverse(T), shared) + alone, by_first + alone_b)
+    second = _of_move((T_a, T_b), shared_b - shared_a, (alone_a, alone_b))
+    return Covariances(times, rigid.carried(rigid.inverse(T), shared) + alone, second)

@@ -60,13 +60,11 @@ def propose(
     if not 3 <= len(keyframes) <= _MOST or len(state.keyframe_features) < len(keyframes):
         return None
     T = state.frames.T_world_body[keyframes] @ state.T_body_cam
-    looked = iter(range(1, 3 * len(keyframes) + 1))
+    counted = _counted(read, 3 * len(keyframes), on_keyframe)
 
     def image(k: int) -> Frame:
-        if on_keyframe is not None:
-            on_keyframe(next(looked), 3 * len(keyframes))
         i = int(keyframes[k])
-        return posed(state, read(i), i).frame
+        return posed(state, counted(i), i).frame
 
     found = _adjusted(state, keyframes, T, lambda k: image(k).rgb)
     if found is None:
@@ -108,14 +106,20 @@ def adopt(
     T = state.frames.T_world_body[found.keyframes] @ state.T_body_cam
     frames = followed(state.frames, found.keyframes, found.T_world_cam @ rigid.inverse(T))
     frames = frames.put(found.keyframes[1:], covariance=found.motion_covariance)
-    mapped, begun = np.flatnonzero(frames.mapped), itertools.count(1)
+    mapped = np.flatnonzero(frames.mapped)
+    return rebuilt(state._replace(frames=frames), mapped, _counted(read, len(mapped), on_frame))
 
-    def told(i: int) -> Frame:
+
+def _counted(read: FrameReader, total: int, on_frame: Callable[[int, int], None] | None) -> FrameReader:
+    """What reads frames, and says how many it has begun, and how many there are to be."""
+    begun = itertools.count(1)
+
+    def counted(i: int) -> Frame:
         if on_frame is not None:  # a map that has to be coarser is made once more
-            on_frame(min(next(begun), len(mapped)), len(mapped))
+            on_frame(min(next(begun), total), total)
         return read(i)
 
-    return rebuilt(state._replace(frames=frames), mapped, told)
+    return counted
 
 
 def _adjusted(
