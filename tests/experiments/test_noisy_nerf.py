@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxpose import fields
 from jaxpose.datasets.photos import blender
+from jaxpose.datasets.photos.sigmas import read_sigmas, write_sigmas
 from jaxpose.datasets.photos.transforms_json import write_transforms
 from jaxpose.datasets.synthetic import pose_noise
 from jaxpose.datasets.synthetic.orbit import orbit
@@ -280,6 +281,8 @@ def test_a_shutter_is_known_ignored_or_estimated(tmp_path):
 def test_a_registration_is_read_as_it_was_written(tmp_path, far):
     T = np.tile(np.eye(4), (3, 1, 1))
     T[:, 0, 3] = 1, 2, 3
+    covariance = np.arange(1, 4)[:, None, None] * np.eye(6)
+    covariance[1] = np.nan
     written = registration.Registered(
         T,
         np.array([True, False, True]),
@@ -291,6 +294,8 @@ def test_a_registration_is_read_as_it_was_written(tmp_path, far):
         0.25,
         True,
         np.array([[0.5, 0.6, 0.7], [1.0, 1.1, 1.2], [2.0, 1.5, 1.2]]),
+        covariance,
+        np.nan if far > 8 else 1.25,
     )
     assert written.varied
     registration.save(tmp_path / "registration.npz", written)
@@ -338,6 +343,37 @@ def test_rough_poses_of_files_give_way_and_held_out_views_are_on_the_trajectory(
     assert error(train.T_world_cam) > 3 and error(found) < 1.5
     # Seen from their stated poses, 3 degrees off, they would not be recognised.
     assert outcome.results["psnr"] > 19 and "the poses of the data agree" not in report(*outcome)
+
+
+@pytest.mark.slow
+def test_stated_sigmas_weigh_poses_and_come_out_smaller(tmp_path):
+    """A quarter is known to 0.5% of the orbit, others to 5%: all end where the sure ones are."""
+    photographs, _ = orbit(40, 64)
+    truth = photographs.T_world_cam
+    for name, rgb in zip(photographs.files, photographs.rgb, strict=True):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        imageio.imwrite(tmp_path / name, rgb)
+    random, sure = np.random.default_rng(0), np.arange(40) % 4 == 0
+    sigma = np.where(sure, 0.1, 1.0)[:, None] * [0.4, 0.4, 0.4, 0.1, 0.1, 0.1]
+    off = rigid.exp(sigma * random.uniform(-1, 1, (40, 6)) * np.sqrt(3))
+    write_transforms(tmp_path / "transforms.json", photographs._replace(T_world_cam=truth @ off))
+    write_sigmas(tmp_path / "known.csv", photographs.files, sigma[:, [0, 3]])
+    config = Config(data=tmp_path, noise="none", pose_sigmas=tmp_path / "known.csv", image_width=64)
+    outcome = noisy_nerf.run(replace(config, steps=100, rays=256, test_pose_steps=0, out=tmp_path / "run"))
+    assert outcome.results["registration"]["given_poses_kept"] is False
+    assert 0.7 < outcome.results["registration"]["stated_off"] < 1.4
+    train, _ = blender.load(tmp_path)
+    row = {name: k for k, name in enumerate(photographs.files)}
+    true = truth[[row[name] for name in train.files]]
+    found = trajectories.read_tum(outcome.folder / "trajectory.txt").T
+    error = lambda T: np.abs(rigid.log(rigid.inverse(T) @ true))  # in the world as it is, without alignment
+    assert np.median(error(train.T_world_cam)[:, :3]) > 0.2
+    sigmas, _ = read_sigmas(outcome.folder / "sigmas.csv", train.files)
+    for columns, of in ((slice(0, 3), 0), (slice(3, 6), 1)):
+        times = np.sqrt(np.mean(error(found)[:, columns] ** 2)) / np.median(sigmas[:, of])
+        assert 0.3 < times < 2.5
+    assert np.median(sigmas[:, 0]) < 0.04
+    assert "sigmas  " in report(*outcome) and "times their sigmas off, by features\n" in report(*outcome)
 
 
 @pytest.mark.slow
@@ -527,6 +563,9 @@ def test_photographs_without_poses(tmp_path):
         (["--spline-knots", "9"], r"--spline-knots: has no effect with --pose posenet"),
         (["--noise-sigma", "1"], r"--noise-sigma: has no effect with --noise correlated"),
         (["--data", "nowhere"], r"nowhere: expected a folder of photographs, or orbit, got nothing"),
+        (["--pose-sigmas", "nowhere.csv", "--smoke"], r"nowhere.csv"),
+        (["--pose-sigmas", "a", "--noise", "unknown"], r"--pose-sigmas: has no effect with --noise unknown"),
+        (["--pose-sigmas", "a", "--preset", "joint"], r"--pose-sigmas: has no effect with --preset joint"),
         (["--resume"], r"--resume: expected --out DIR or --name NAME"),
         (["--exposure-ms", "-1"], r"--exposure-ms: expected at least 0, got -1"),
         (["--line-delay-us", "inf"], r"--line-delay-us: expected a finite number, got inf"),

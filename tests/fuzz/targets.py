@@ -15,6 +15,7 @@ from jaxpose.cli.source import read_field, read_source
 from jaxpose.cli.view.scene import read_scene
 from jaxpose.datasets.events import registry as event_registry
 from jaxpose.datasets.photos import blender, llff
+from jaxpose.datasets.photos.sigmas import read_sigmas, write_sigmas
 from jaxpose.datasets.rgbd import registry as rgbd_registry
 from jaxpose.datasets.rgbd.imu_csv import read_imu, read_mounting
 from jaxpose.experiments.noisy_nerf import registration
@@ -26,6 +27,7 @@ from jaxpose.geometry.camera import Camera
 
 COUNT, WIDTH, HEIGHT = 5, 16, 12
 CAMERA = Camera(15.0, 15.0, 7.5, 5.5, WIDTH, HEIGHT)
+_NAMES = tuple(f"{k}.png" for k in range(COUNT))
 _BOX = (0.0, 0.0, 2.0), (1.0, 1.0, 1.0)
 NS = 1403715523912140001
 
@@ -408,10 +410,15 @@ TARGETS = {
         lambda folder: registration.save(
             folder / "r.npz",
             registration.Registered(
-                _poses(), np.ones(COUNT, bool), *_BOX, 0.5, 9.0, 7, 0.3, True, np.full((COUNT, 3), 1.25)
+                *(_poses(), np.ones(COUNT, bool), *_BOX, 0.5, 9.0, 7, 0.3, True, np.full((COUNT, 3), 1.25)),
+                *(np.tile(np.eye(6), (COUNT, 1, 1)), 1.5),
             ),
         ),
         _of("r.npz", lambda file: registration.load(file, COUNT)._replace(far=1.0)),  # may be infinite
+    ),
+    "pose_sigmas": Target(
+        lambda folder: write_sigmas(folder / "s.csv", _NAMES, np.full((COUNT, 2), 0.25)),
+        _of("s.csv", lambda file: read_sigmas(file, _NAMES)[0]),
     ),
     "blender": Target(_blender, partial(_photographs, blender.load)),
     "llff": Target(_llff, partial(_photographs, llff.load)),

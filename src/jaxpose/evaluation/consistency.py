@@ -10,6 +10,8 @@ from jaxpose._checks import check_shapes
 from jaxpose.errors import DataError
 from jaxpose.geometry import rigid
 
+MEDIAN_CHI2 = 5.348  # of chi-squared of six numbers
+
 
 class Consistency(NamedTuple):
     """Errors against covariances.

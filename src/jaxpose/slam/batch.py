@@ -12,6 +12,7 @@ from jaxtyping import Float, Int
 
 from jaxpose.estimate import Posterior, smooth
 from jaxpose.estimate.posterior import table_times
+from jaxpose.evaluation.consistency import MEDIAN_CHI2
 from jaxpose.fields import Covariances, Params, PoseField, bspline, fit
 from jaxpose.geometry import rigid
 from jaxpose.imu import Imu
@@ -25,7 +26,6 @@ SEEN_AGAIN_S = 4.0  # in which the map's error is forgotten: experiments/estimat
 _RESOLVED = 1e-5  # [m, rad] that poses in float32 resolve
 _OF_MOTION = 1 / 3  # a motion between keyframes has both's own errors in it, and the step of the map's
 _SAME_TIME = 1e-6  # [s]
-_MEDIAN_SQUARE = 5.348  # of chi-squared of six numbers
 _ALIKE = 4  # registered frames to either side whose covariances are averaged: that of one is of 16 numbers
 
 
@@ -185,7 +185,7 @@ def inflation(
     off = rigid.log(rigid.inverse(moved) @ otherwise)
     known = _of_move((T_world_cam[a], T_world_cam[b]), of_map[b] - of_map[a], (own[a], own[b]))
     squares = np.einsum("ni,ni->n", off, np.linalg.solve(known, off[..., None])[..., 0])
-    return max(float(np.median(squares)) / _MEDIAN_SQUARE, 1.0)
+    return max(float(np.median(squares)) / MEDIAN_CHI2, 1.0)
 
 
 def _of_map(

@@ -19,9 +19,11 @@ from jaxpose.evaluation.trajectory_error import align, procrustes
 from jaxpose.geometry import rigid
 from jaxpose.geometry.rigid import Similarity
 from jaxpose.structure.global_poses import global_poses
+from jaxpose.structure.prior import Prior, stated_prior
 from jaxpose.structure.relative import MEDIAN_LENGTH, sums
 from jaxpose.structure.schur import System, eliminate_points, normal_equations
 from jaxpose.structure.tracks import Tracks
+from jaxpose.structure.uncertainty import aligned_covariances, covariances
 
 _OUTLIER = 3.0  # sigmas of reprojection
 _FEWEST = 12  # observations that agree, of a photograph whose pose is believed
@@ -33,6 +35,8 @@ _WEIGHINGS, _WEIGHED = 5, 0.05  # at most so many, and the share by which weight
 _STEPS, _SETTLED = 15, 1e-3  # of a stage: at most so many, and the share by which its loss has to fall
 _NEAREST = 1e-2  # of the usual depth, in front of a camera
 _WIDEST = 1e-2  # spread of camera centres, in usual depths, below which they are all in one place
+_UNDAMPED = 1e-12
+_IN_PLACE = Similarity(1.0, np.eye(3), np.zeros(3))
 
 
 class Bundle(NamedTuple):
@@ -44,6 +48,8 @@ class Bundle(NamedTuple):
     depth: Float[np.ndarray, " k"]  # of every observation that agrees, along the optical axis
     noise_px: float  # sigma of the reprojection errors that agree
     start_agrees: float  # share of the observations that agree, which do with the poses it started from too
+    # Of right increments, translation first; NaN where not `supported`, unless their poses were known before.
+    covariance: Float[np.ndarray, "n 6 6"]
 
 
 class _Problem(NamedTuple):
@@ -58,6 +64,7 @@ class _Problem(NamedTuple):
     nearest: float  # depth in front of a camera
     by_view: sp.csr_matrix  # (n, o), sums over the observations of each view
     by_point: sp.csr_matrix  # (m, o)
+    prior: Prior | None = None
 
 
 class _Errors(NamedTuple):
@@ -80,8 +87,9 @@ def adjust(
     T_start: Float[np.ndarray, "n 4 4"],
     depth: float,
     on_step: Callable[[float, float], None] = lambda sigma, error: None,
+    information: Float[np.ndarray, "n 6 6"] | None = None,
 ) -> Bundle | None:
-    """Find the poses that agree with what photographs share.
+    """Find the poses that agree with what photographs share, and with what was known of them before.
 
     Args:
         tracks: What they share.
@@ -89,12 +97,18 @@ def adjust(
         depth: Where points are along the optical axis, as far as it is known: it settles the scale if all
             poses start in one place.
         on_step: Called after every stage with the width of the loss and the median error [px].
+        information: (n, 6, 6) of `T_start`, over right increments, translation first: how sure each is. They
+            then hold the world. None: nothing is known, and the world is where the poses found are closest
+            to those at the start.
 
     Returns:
-        Poses and points; None where fewer than half the photographs share enough.
+        Poses and points; None where fewer than half the photographs share enough. Covariances are by the
+        spread of the errors that agree, as if these were independent, and where nothing else was known of
+        what is left after an alignment of the camera centres.
 
     Raises:
-        ValueError: For poses of another number or shape, or not finite, and a depth that is not above 0.
+        ValueError: For poses of another number or shape, or not finite, a depth that is not above 0, and
+            information that is not positive definite.
     """
     check_shapes(T_start=(T_start, f"{tracks.views} 4 4"))
     check_finite(T_start=T_start)
@@ -103,16 +117,39 @@ def adjust(
     problem = _problem(tracks, _NEAREST * depth)
     if problem is None:
         return None
+    if information is not None:
+        problem = problem._replace(prior=stated_prior(T_start, information))
+    problem, best = _weighed(problem, _best(problem, T_start, depth, on_step), depth, on_step)
+    return _believed(problem, best, T_start, depth)
+
+
+def _best(
+    problem: _Problem,
+    T_start: Float[np.ndarray, "n 4 4"],
+    depth: float,
+    on_step: Callable[[float, float], None],
+) -> _Solution:
+    """The one of least loss, of the descents from every start."""
     found = [_solution(problem, T, depth, on_step) for T in _starts(problem, T_start, depth)]
     width = _OUTLIER * min(each.sigma for each in found)
-    best = min(found, key=lambda each: _loss(each.errors, width))
-    problem, best = _weighed(problem, best, depth, on_step)
+    return min(found, key=lambda each: _loss(problem, each.T, each.errors, width))
+
+
+def _believed(
+    problem: _Problem, best: _Solution, T_start: Float[np.ndarray, "n 4 4"], depth: float
+) -> Bundle | None:
+    """What of a solution enough observations agree with, in the world of the start."""
     T, points, errors, sigma = best
     agree = errors.size < _OUTLIER * sigma
     supported = np.asarray(problem.by_view @ agree.astype(np.float64)) >= _FEWEST
     if supported.sum() < max(_FEWEST_TIED, len(T) / 2):
         return None
-    to_start = _gauge(T[supported], T_start[supported], errors.point_cam[agree, 2], depth)
+    covariance = _covariances(problem, best, supported)
+    to_start = _IN_PLACE
+    if problem.prior is None:
+        to_start = _gauge(T[supported], T_start[supported], errors.point_cam[agree, 2], depth)
+        covariance[:, :3] *= to_start.scale
+        covariance[:, :, :3] *= to_start.scale
     moved = np.where(supported[:, None, None], align(to_start, T), T_start)
     agree &= supported[problem.view]
     seen = np.unique(problem.point[agree])
@@ -123,7 +160,8 @@ def adjust(
     at_start = _reproject(right, T_start, _start_points(right, T_start, depth)).size
     size = errors.size[agree]
     noise = sigma * float(np.median(size / problem.weight[agree]) / max(np.median(size), 1e-12))
-    return Bundle(moved, supported, place, depths, noise, float(np.mean(at_start < _OUTLIER * sigma)))
+    start_agrees = float(np.mean(at_start < _OUTLIER * sigma))
+    return Bundle(moved, supported, place, depths, noise, start_agrees, covariance)
 
 
 def _solution(
@@ -249,10 +287,13 @@ def _reproject(problem: _Problem, T: Float[np.ndarray, "n 4 4"], points: Float[n
     return _Errors(point_cam, residual, np.where(front, np.linalg.norm(residual, axis=1), np.inf))
 
 
-def _loss(errors: _Errors, width: float) -> float:
-    """Geman and McClure's, in squares of the width; 1 behind a camera."""
+def _loss(problem: _Problem, T: Float[np.ndarray, "n 4 4"], errors: _Errors, width: float) -> float:
+    """Geman and McClure's, in squares of the width, 1 behind a camera; and what the prior says."""
     ratio = (np.where(np.isfinite(errors.size), errors.size, 0) / width) ** 2
-    return float(np.where(np.isfinite(errors.size), ratio / (1 + ratio), 1.0).sum())
+    seen = float(np.where(np.isfinite(errors.size), ratio / (1 + ratio), 1.0).sum())
+    if problem.prior is None:
+        return seen
+    return seen + problem.prior.chi2(T) / _OUTLIER**2
 
 
 def _stage(
@@ -261,14 +302,14 @@ def _stage(
     """Levenberg and Marquardt's descent of a loss of one width."""
     width, damping = _OUTLIER * sigma, 1e-3
     errors = _reproject(problem, T, points)
-    loss = _loss(errors, width)
+    loss = _loss(problem, T, errors, width)
     for _ in range(_STEPS):
         system = _normal_equations(problem, T, errors, width)
         while True:
-            twist, shift = _solve(problem, system, damping)
+            twist, shift = _solve(problem, T, system, damping)
             moved, placed = T @ rigid.exp(twist), points + shift
             after = _reproject(problem, moved, placed)
-            lower = _loss(after, width)
+            lower = _loss(problem, moved, after, width)
             if lower < loss:
                 break
             damping *= 8
@@ -299,12 +340,35 @@ def _normal_equations(
 
 
 def _solve(
-    problem: _Problem, system: System, damping: float
+    problem: _Problem, T: Float[np.ndarray, "n 4 4"], system: System, damping: float
 ) -> tuple[Float[np.ndarray, "n 6"], Float[np.ndarray, "m 3"]]:
     """The increments of poses and points, the points eliminated."""
     reduced = eliminate_points(system, problem.by_view.indptr, problem.point, damping)
-    twist = -np.linalg.solve(reduced.matrix.toarray(), reduced.by_view).reshape(-1, 6)
+    matrix, down = reduced.matrix.toarray(), reduced.by_view
+    if problem.prior is not None:
+        known, to_known = problem.prior.normal_equations(T)
+        matrix, down = matrix + known / _OUTLIER**2, down + to_known / _OUTLIER**2
+    twist = -np.linalg.solve(matrix, down).reshape(-1, 6)
     return twist, reduced.shift(twist)
+
+
+def _covariances(
+    problem: _Problem, solution: _Solution, supported: Bool[np.ndarray, " n"]
+) -> Float[np.ndarray, "n 6 6"]:
+    """Of all poses, by what supported photographs have seen and by the prior."""
+    T, _, errors, sigma = solution
+    system = _normal_equations(problem, T, errors, _OUTLIER * sigma)
+    reduced = eliminate_points(system, problem.by_view.indptr, problem.point, _UNDAMPED)
+    seen = np.flatnonzero(np.repeat(supported, 6))
+    information = _OUTLIER**2 * reduced.matrix.toarray()[np.ix_(seen, seen)]
+    covariance = np.full((len(T), 6, 6), np.nan)
+    if problem.prior is None:
+        covariance[supported] = aligned_covariances(T[supported], information)
+    else:
+        covariance[~supported] = np.linalg.inv(problem.prior.information[~supported])
+        known, _ = problem.prior.normal_equations(T)
+        covariance[supported] = covariances(information + known[np.ix_(seen, seen)])
+    return covariance
 
 
 def _gauge(

@@ -50,6 +50,7 @@ def align_patches(
     point: Int[np.ndarray, " o"],
     pixel: Float[np.ndarray, "o 2"],
     enlarged: int = 1,
+    on_view: Callable[[int, int], None] = lambda done, total: None,
 ) -> Aligned:
     """Move every feature of a point to where the patch of one of them is.
 
@@ -59,6 +60,7 @@ def align_patches(
         point: Which point it is of (o,).
         pixel: Where it was found (o, 2) [px].
         enlarged: How much photographs are enlarged for it.
+        on_view: Called with how many photographs were begun, and how many there are.
 
     Returns:
         The features, and which of them agree with their point's patch.
@@ -95,6 +97,7 @@ def align_patches(
                 begun.append(workers.submit(align, read(index), rows))
             if len(begun) > _AT_ONCE:
                 begun.popleft().result()
+            on_view(index + 1, len(views))
         for each in begun:
             each.result()
     alone = np.bincount(point[found], minlength=int(point.max(initial=-1)) + 1)[point] < 2

@@ -7,6 +7,7 @@ are OpenCV's.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import cv2
@@ -83,7 +84,8 @@ def find_tracks(
         on_step("pairs", done + 1, len(pairs))
     view, feature, point = joined(sorted(found), [len(each.pixel) for each in features])
     pixel = np.array([features[v].pixel[f] for v, f in zip(view, feature, strict=True)]).reshape(-1, 2)
-    placed = align_patches(rgb.__getitem__, view, point, pixel, _enlarged(rgb[0]))
+    on_view = partial(on_step, "patches")
+    placed = align_patches(rgb.__getitem__, view, point, pixel, _enlarged(rgb[0]), on_view)
     return Tracks(view, point, unproject_numpy(camera, placed.pixel)[:, :2], len(rgb), focal, placed.found)
 
 

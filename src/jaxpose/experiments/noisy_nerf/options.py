@@ -11,6 +11,7 @@ from scipy.spatial.distance import pdist
 
 from jaxpose.datasets.origin import far_origin, moved
 from jaxpose.datasets.photos.registry import load_photographs
+from jaxpose.datasets.photos.sigmas import read_sigmas
 from jaxpose.datasets.photos.transforms_json import stated
 from jaxpose.datasets.synthetic import pose_noise
 from jaxpose.datasets.synthetic.orbit import DIAMETER, orbit
@@ -64,6 +65,10 @@ class Config:
     noise_translation: float = 0.2  # largest deviation, as a share of the largest distance between cameras
     noise_rotation_deg: float = 0.0  # [deg] largest deviation
     noise_sigma: float = 0.15  # of independent noise, BARF's [rad and scene units]
+    # A table of how sure the poses are that the run starts from, which then weigh as much as that says and
+    # hold the world: lines of image, sigma of position [scene units] and of rotation [deg]; image * is every
+    # other one. None: nothing is known of it.
+    pose_sigmas: Path | None = None
     # Which side of the camera's pose the noise is on, and the field that undoes it: the supplement's formula
     # has the world's, where turning goes about the world's origin; on the camera's it turns out of view.
     side: Literal["world", "camera"] = "world"
@@ -129,6 +134,10 @@ class Config:
     def _check_unused(self):
         if self.noise != "correlated":
             check_unused(self, ("noise_translation", "noise_rotation_deg"), f"with --noise {self.noise}")
+        if self.noise == "unknown":
+            check_unused(self, ("pose_sigmas",), "with --noise unknown")
+        if self.preset != "fast":
+            check_unused(self, ("pose_sigmas",), f"with --preset {self.preset}, which knows no features")
         if self.noise != "independent":
             check_unused(self, ("noise_sigma",), f"with --noise {self.noise}")
         if self.data == ORBIT:
@@ -163,6 +172,8 @@ class Problem(NamedTuple):
     extent: float  # largest distance between true cameras [scene units]; NaN where none is known
     metadata: dict[str, Any]  # the data and the noise in words and numbers
     origin: np.ndarray = np.zeros(3)  # (3,) of the poses' world in that of the data
+    # Of `T_start`, position [scene units] and rotation [rad], where they are stated.
+    sigmas: Float[np.ndarray, "n 2"] | None = None
 
 
 def load(config: Config) -> Problem:
@@ -182,6 +193,9 @@ def load(config: Config) -> Problem:
     origin = far_origin(train.T_world_cam, _FAR * extent)
     train, held_out = (p._replace(T_world_cam=moved(p.T_world_cam, -origin)) for p in (train, held_out))
     T_start, words = disturbed(config, train, extent)
+    sigmas, of_sigmas = None, ()
+    if config.pose_sigmas is not None:
+        sigmas, of_sigmas = read_sigmas(config.pose_sigmas, train.files)
     strange = sorted({seen.kind for seen in train.lenses if stated(seen) is None})
     unwritten = [
         f"transforms.json has no lens {kind}: trajectory.txt alone holds the poses" for kind in strange
@@ -193,9 +207,9 @@ def load(config: Config) -> Problem:
         "size": (train.camera.width, train.camera.height),
         "extent": extent,
         "noise": words,
-        "notes": (*train.notes, *unwritten),
+        "notes": (*train.notes, *unwritten, *of_sigmas),
     }
-    return Problem(train, held_out, T_start, extent, metadata, origin)
+    return Problem(train, held_out, T_start, extent, metadata, origin, sigmas)
 
 
 def _photographs(config: Config) -> tuple[Photographs, Photographs]:

@@ -21,7 +21,9 @@ from jaxpose.datasets.lens import as_camera
 from jaxpose.datasets.origin import moved
 from jaxpose.datasets.photos import blender
 from jaxpose.datasets.photos.registry import find_format, images_folder
+from jaxpose.datasets.photos.sigmas import write_sigmas
 from jaxpose.datasets.photos.transforms_json import stated, write_transforms
+from jaxpose.evaluation.trajectory_error import align, procrustes
 from jaxpose.experiments import devices, training_loop
 from jaxpose.experiments.command import MODULE, Command, execute
 from jaxpose.experiments.devices import Job
@@ -176,10 +178,16 @@ def _single(
     T_held_out = poses_at(problem.held_out.t) if contradicted else None
     T_world_cam = poses_at(problem.train.t)
     measured = measure(config, problem, model, trained.state, T_world_cam, T_held_out, on_update)
+    if contradicted and registered and problem.sigmas is not None:  # which hold the world
+        to_world = procrustes(T_world_cam, registered.T_world_cam)
+        measured = measured._replace(T_estimate=align(to_world, T_world_cam), alignment=to_world)
     protocol = CONTRADICTED_PROTOCOL if contradicted else PROTOCOL
     on_update(Update("drawing figures"))
     _draw(folder, config, problem, measured, trained)
     _write_poses(folder, config, problem, measured)
+    sigmas = None if registered is None else registration.final_sigmas(registered, measured.T_estimate)
+    if sigmas is not None:
+        write_sigmas(folder / "sigmas.csv", problem.train.files, sigmas.of_poses)
     to_data = measured.alignment._replace(translation=measured.alignment.translation + problem.origin)
     save(folder / "field.npz", model.field, trained.state.pose, alignment=to_data)
     results = training_loop.results_of(
@@ -191,6 +199,7 @@ def _single(
         registration=registration.summary(problem, registered),
         training=describe(config, model),
         protocol=protocol if measured.posed else UNPOSED_PROTOCOL,
+        sigmas=None if sigmas is None else sigmas.numbers(),
         shutter=found_shutter(config, model, trained.state.pose),
         **measured.numbers,
     )

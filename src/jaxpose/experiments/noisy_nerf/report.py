@@ -57,10 +57,25 @@ def _registered(found: dict[str, Any] | None) -> list[str]:
     error = ": the poses of the data agree, and stay" if found["given_poses_kept"] else error
     stops = found["exposure_stops"]
     exposed = [f"  exposures    differ by {stops:.2f} stops: photographs are brought to one"] if stops else []
+    off, stated = found["stated_off"], []
+    if off is not None:
+        wrong = "" if 0.5 < off < 2 else f": state {'larger' if off > 1 else 'smaller'} ones"
+        stated = [f"  stated       poses are {off:.2f} times their sigmas off, by features{wrong}"]
     return [
         f"  features     place {found['photographs']} photographs by {found['points']} points, "
         f"{found['noise_px']:.2f} px{error}",
+        *stated,
         *exposed,
+    ]
+
+
+def _sure(sigmas: dict[str, float] | None) -> list[str]:
+    """How sure the poses are."""
+    if sigmas is None:
+        return []
+    return [
+        f"  sigmas       {sigmas['position']:.3g} scene units and {sigmas['rotation_deg']:.2g} deg an axis "
+        f"(median): {sigmas['times_features']:.1f} times features' own, as colours have moved poses"
     ]
 
 
@@ -90,6 +105,7 @@ def report(folder: Path, results: dict[str, Any]) -> str:
         f"  noise        {data['noise']}{':' if at_start else ''}",
         *at_start,
         *_registered(one.get("registration")),
+        *_sure(one.get("sigmas")),
         "",
         table(runs),
         "",
