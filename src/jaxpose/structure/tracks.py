@@ -6,6 +6,7 @@ them (Nister 2004, RANSAC), moved to where their patches agree. Detection, descr
 are OpenCV's.
 """
 
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -25,6 +26,7 @@ _SMALL_PX = 200  # images below it are enlarged twice: their finest blobs are to
 _RATIO = 0.85  # of the distance to the best match against that to the second best
 OUTLIER_PX = 0.7  # from the epipolar line
 _AGREE = 0.5  # share of two photographs' matches that has to
+_SURE = 0.9999  # that RANSAC finds a motion
 _ALL_PAIRS = 40  # photographs, up to which each is matched with each
 _NEIGHBOURS, _ALIKE = 6, 10  # else: photographs before and after, and most alike, that each is matched with
 _SHORTEST = 3  # photographs that see a point
@@ -159,11 +161,20 @@ def _verified(
     none = np.zeros(0, int)
     if len(a) < FEWEST:
         return none
+    fewest = max(FEWEST, _AGREE * len(a))
+    # Samples of five that find so many that agree, twice as often as without noise; fewer are not believed.
+    samples = 2 * math.log(1 - _SURE) / math.log1p(-min((fewest / len(a)) ** 5, _SURE))
     _, chosen = cv2.findEssentialMat(
-        a, b, np.eye(3), method=cv2.USAC_ACCURATE, prob=0.9999, threshold=OUTLIER_PX / focal
+        a,
+        b,
+        np.eye(3),
+        method=cv2.USAC_ACCURATE,
+        prob=_SURE,
+        threshold=OUTLIER_PX / focal,
+        maxIters=math.ceil(samples),
     )
     kept = none if chosen is None else np.flatnonzero(chosen)
-    return kept if len(kept) >= max(FEWEST, _AGREE * len(a)) else none
+    return kept if len(kept) >= fewest else none
 
 
 def joined(
