@@ -66,24 +66,13 @@ def detect(frame: Frame, camera: Camera) -> Features:
     keypoints, descriptor = _detector().compute(grey, _spread(_detector().detect(grey, None), grey.shape))
     if descriptor is None:
         return Features(np.zeros((0, 3)), np.zeros(0), np.zeros(0), np.zeros((0, 32), np.uint8))
+    pixel = np.array([k.pt for k in keypoints], np.float64)
     scale = _PYRAMID[0] ** np.array([k.octave for k in keypoints], np.float64)
-    pixel = _in_image(np.array([k.pt for k in keypoints], np.float64), scale, grey.shape)
     column, row = np.rint(pixel).astype(int).T
     depth = frame.depth[row, column].astype(np.float64)
     features = Features(unproject_numpy(camera, pixel), depth, scale, descriptor)
     known = depth[depth > 0]
     return features._replace(usual_depth=float(np.median(known))) if len(known) else features
-
-
-def _in_image(
-    pixel: Float[np.ndarray, "n 2"], scale: Float[np.ndarray, " n"], shape: tuple[int, int]
-) -> Float[np.ndarray, "n 2"]:
-    """Where corners of levels are: OpenCV multiplies indices by the level's scale, as if pixels had no width.
-
-    Levels are as large as whole pixels are, and made so that their outer edges meet.
-    """
-    size, scale = np.array(shape[::-1]), scale[:, None]
-    return (pixel / scale + 0.5) * size / np.rint(size / scale) - 0.5
 
 
 def locate_camera(
