@@ -564,6 +564,10 @@ def test_photographs_without_poses(tmp_path):
         (["--noise-sigma", "1"], r"--noise-sigma: has no effect with --noise correlated"),
         (["--data", "nowhere"], r"nowhere: expected a folder of photographs, or orbit, got nothing"),
         (["--pose-sigmas", "nowhere.csv", "--smoke"], r"nowhere.csv"),
+        (
+            ["--pose-sigmas", "a/sigmas.csv", "--out", "a"],
+            r"--out: expected another place than the input, got a",
+        ),
         (["--pose-sigmas", "a", "--noise", "unknown"], r"--pose-sigmas: has no effect with --noise unknown"),
         (["--pose-sigmas", "a", "--preset", "joint"], r"--pose-sigmas: has no effect with --preset joint"),
         (["--resume"], r"--resume: expected --out DIR or --name NAME"),
@@ -581,7 +585,7 @@ def test_photographs_without_poses(tmp_path):
     ],
 )
 def test_bad_options_are_one_line(args, expected, tmp_path):
-    out = [] if "--resume" in args else ["--out", tmp_path / "out"]
+    out = [] if {"--resume", "--out"} & set(args) else ["--out", tmp_path / "out"]
     line = complaint(*args, *out)
     assert line.startswith("noisy_nerf: ")
     assert re.search(expected, line), line

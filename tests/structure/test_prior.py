@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from jaxpose.evaluation.trajectory_error import align, procrustes
 from jaxpose.geometry import rigid
 from jaxpose.structure import adjust
+from jaxpose.structure.uncertainty import aligned_covariances, covariances
 
 _HOLDS_90 = 10.64  # chi-squared of six numbers
 
@@ -90,6 +91,13 @@ def test_sure_poses_hold_the_world():
     free = adjust(tracks, start, depth=4.0)
     assert np.abs(free.T_world_cam[others, :3, 3] - T[others, :3, 3]).max() > 0.1
     assert np.isnan(free.covariance[9]).all()
+
+
+def test_what_is_held_by_nothing_has_no_covariance():
+    T, tied = around(4), np.eye(24)
+    assert_allclose(covariances(4 * tied), np.tile(np.eye(6) / 4, (4, 1, 1)))
+    assert np.isnan(covariances(np.diag(np.r_[0.0, np.ones(23)]))).all()
+    assert np.isnan(aligned_covariances(T, np.zeros((24, 24)))).all()
 
 
 def test_bad_input():

@@ -64,6 +64,20 @@ def consistency(
     return Consistency(float(square.mean()), band, half_inside, most_inside, len(error), independent)
 
 
+def variance_factor(error: Float[np.ndarray, "n 6"], covariance: Float[np.ndarray, "n 6 6"]) -> float:
+    """What covariances are to be multiplied by so that they explain errors: by medians, whatever a few are.
+
+    Args:
+        error: increments (n, 6), at least one.
+        covariance: their covariances as stated (n, 6, 6).
+
+    Returns:
+        1 or more: errors that are smaller do not make anything surer.
+    """
+    square = np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[..., None])[..., 0])
+    return max(float(np.median(square)) / MEDIAN_CHI2, 1.0)
+
+
 def relative_error(
     estimate: tuple[Float[np.ndarray, "n 4 4"], Float[np.ndarray, "n 4 4"]],
     truth: tuple[Float[np.ndarray, "n 4 4"], Float[np.ndarray, "n 4 4"]],

@@ -30,7 +30,7 @@ from jaxpose.training.steps import State, Trainer
 CHUNK = 100  # steps in one compiled call
 COLUMNS = ("step", "loss", "rotation_deg", "translation", "seconds")
 _SAVE_EVERY_S = 30.0
-_KEPT = "checkpoint.npz", "registration.npz", "results.json"  # of a run that is resumed
+_KEPT = "checkpoint.npz", "registration.npz", "sigmas.csv", "results.json"  # of a run that is resumed
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 
 from jaxpose.estimate import Posterior, smooth
 from jaxpose.estimate.posterior import table_times
-from jaxpose.evaluation.consistency import MEDIAN_CHI2
+from jaxpose.evaluation.consistency import variance_factor
 from jaxpose.fields import Covariances, Params, PoseField, bspline, fit
 from jaxpose.geometry import rigid
 from jaxpose.imu import Imu
@@ -184,8 +184,7 @@ def inflation(
     otherwise = rigid.inverse(T_other[places[first]]) @ T_other[places[last]]
     off = rigid.log(rigid.inverse(moved) @ otherwise)
     known = _of_move((T_world_cam[a], T_world_cam[b]), of_map[b] - of_map[a], (own[a], own[b]))
-    squares = np.einsum("ni,ni->n", off, np.linalg.solve(known, off[..., None])[..., 0])
-    return max(float(np.median(squares)) / MEDIAN_CHI2, 1.0)
+    return variance_factor(off, known)
 
 
 def _of_map(

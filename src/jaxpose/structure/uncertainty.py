@@ -9,10 +9,10 @@ def covariances(information: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "n 6
     """Of each camera, where all together are held in the world.
 
     Args:
-        information: (6 n, 6 n) of right increments of all cameras, of full rank.
+        information: (6 n, 6 n) of right increments of all cameras.
 
     Returns:
-        Covariances of right increments.
+        Covariances of right increments; NaN where the information has no inverse.
     """
     return _blocks(_inverse(information))
 
@@ -31,7 +31,7 @@ def aligned_covariances(
         information: (6 n, 6 n) of right increments of all cameras; similarities of the world change nothing.
 
     Returns:
-        Covariances of right increments.
+        Covariances of right increments; NaN where the information leaves more than the similarity open.
     """
     free = _similarities(T_world_cam)
     filled = information + np.trace(information) / len(information) * free @ free.T
@@ -56,7 +56,12 @@ def _similarities(T: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "k 7"]:
 
 
 def _inverse(information: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "k k"]:
-    return scipy.linalg.cho_solve(scipy.linalg.cho_factor(information), np.eye(len(information)))
+    """NaN where something is held by nothing."""
+    try:
+        factor = scipy.linalg.cho_factor(information)
+    except np.linalg.LinAlgError:
+        return np.full_like(information, np.nan)
+    return scipy.linalg.cho_solve(factor, np.eye(len(information)))
 
 
 def _blocks(covariance: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "n 6 6"]:

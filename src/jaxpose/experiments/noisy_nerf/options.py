@@ -111,7 +111,8 @@ class Config:
             raise ValueError(f"--noise-rotation-deg: expected at most 180, got {self.noise_rotation_deg:g}")
         if self.steps is not None and self.steps % CHUNK:
             raise ValueError(f"--steps: expected a multiple of {CHUNK}, got {self.steps}")
-        check_run_folder(self, None if self.data == ORBIT else self.data)
+        sigmas_in = None if self.pose_sigmas is None else self.pose_sigmas.parent
+        check_run_folder(self, None if self.data == ORBIT else self.data, sigmas_in)
         check_devices(self)
         if self.study is not None and self.preset == "fast":
             raise ValueError(

@@ -217,7 +217,10 @@ def _registered(
     if found is None:
         found = registration.register(config, problem, on_update)
         if found is None:
-            on_update(Update("too few features are shared: poses by the colours, as with --preset joint"))
+            unused = "" if problem.sigmas is None else "; --pose-sigmas then weighs nothing"
+            on_update(
+                Update(f"too few features are shared: poses by the colours, as with --preset joint{unused}")
+            )
         elif job.writes:
             registration.save(folder / _REGISTRATION, found)
     return found

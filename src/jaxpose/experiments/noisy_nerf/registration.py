@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxpose.evaluation import trajectory_error
-from jaxpose.evaluation.consistency import MEDIAN_CHI2
+from jaxpose.evaluation.consistency import MEDIAN_CHI2, variance_factor
 from jaxpose.experiments.noisy_nerf.options import Config, Problem, middle
 from jaxpose.experiments.progress import OnUpdate, Update
 from jaxpose.files import atomic
@@ -138,8 +138,7 @@ def final_sigmas(registered: Registered, T_estimate: Float[np.ndarray, "n 4 4"])
     found, covariance = registered.T_world_cam[known], registered.covariance[known]
     to_found = trajectory_error.procrustes(T_estimate[known], found)
     moved = rigid.log(rigid.inverse(found) @ trajectory_error.align(to_found, T_estimate[known]))
-    squares = np.einsum("ni,ni->n", moved, np.linalg.solve(covariance, moved[..., None])[..., 0])
-    more = max(float(np.median(squares)) / MEDIAN_CHI2, 1.0)
+    more = variance_factor(moved, covariance)
     of_poses = np.full((len(T_estimate), 2), np.nan)
     of_poses[known] = np.sqrt(more * np.einsum("naiai->na", covariance.reshape(-1, 2, 3, 2, 3)) / 3)
     of_poses[:, 0] /= to_found.scale
